@@ -210,11 +210,11 @@ class Lights:
             return before.turned_to(float(7 * number % 360))
         if edit == "material":
             grey = np.where(self._thing[:, None], 0.1 + 0.8 * (number % 7) / 7, self.scene.base_color)
-            changed = before.relighter.changed(replace(self.scene, base_color=grey))
-            return changed.still_under(before).framed(rays=estimation.rays, filtered=estimation.filtered)
-        by = np.array([0.002 * (number % 50), 0.0, 0.0])
-        other = before.relighter.changed(moved(self.scene, self._thing, translation=by))
-        light = other.under(before.lighting, before.seed)
+            scene = replace(self.scene, base_color=grey)
+        else:
+            by = np.array([0.002 * (number % 50), 0.0, 0.0])
+            scene = moved(self.scene, self._thing, translation=by)
+        light = before.relighter.bring(scene, before.lighting, before=before)
         return light.framed(rays=estimation.rays, filtered=estimation.filtered)
 
 

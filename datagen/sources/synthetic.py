@@ -316,12 +316,16 @@ def _moment(
     time: float,
 ) -> _Moment:
     """The scene at a time from 0 to 1 under the lights of these numbers; moves the geometry."""
-    recipe = settings.split(spec.split)
+    recipe, scene = settings.split(spec.split), relighter.scene
     if spec.motion is not None:
-        which = relighter.scene.object_id == _move(spec, geometry, time)
+        which = scene.object_id == _move(spec, geometry, time)
         if time and which.any():
-            relighter = relighter.changed(moved(relighter.scene, which, *_pose(spec, time)))
-    lights = [_prepare(spec, relighter, number, map_, settings, time) for number, map_ in maps.items()]
+            scene = moved(scene, which, *_pose(spec, time))
+    lights: list[_Lit] = []
+    for number, map_ in maps.items():
+        relighter = lights[-1].lit.relighter if lights else relighter
+        lights.append(_prepare(spec, relighter, scene, number, map_, settings, time))
+    relighter = lights[-1].lit.relighter
     together = spec.cameras.shared
     if together and not recipe.reference_buffers:
         scenes = [geometry.lit()]
@@ -419,6 +423,7 @@ def _meter(
 def _prepare(
     spec: SceneSpec,
     relighter: Relighter,
+    scene: GaussianScene,
     number: int,
     environment: EnvironmentMap,
     settings: Settings,
@@ -429,7 +434,8 @@ def _prepare(
         environment = environment.rotated(spec.turns_deg[number] * time)
     if shared:  # lights that are traced together have texels at the same places
         environment = environment.baked().resized(settings.environment_height)
-    lit = relighter.under(environment, integer(spec.seed, spec.split, spec.index, "light", number, "bounce"))
+    seed = integer(spec.seed, spec.split, spec.index, "light", number, "bounce")
+    lit = relighter.bring(scene, environment, seed=seed)
     frames = settings.estimation(spec.split, spec.index, number)
     lit = lit.framed(**{name: getattr(frames, name) for name in OF_FRAMES})
     own = ("light", number, "frame")

@@ -202,8 +202,8 @@ class Reconstruction(Benchmark):
     def _reconstruct_thick(self, stages: Stages, folder: Path) -> list[Made]:
         """A thick scan of the first scene of photographs of its own, as it is and with materials."""
         from eval.reconstruction.scans import write_scan
-        from tron.apps.relight.camera_files import CAMERAS
         from tron.gaussians.scene import GaussianScene
+        from tron.scans.camera_files import CAMERAS
 
         dataset = folder / SCANNED
         arguments = [*self.splats.photographs, f"output_dir={dataset}"]

@@ -15,7 +15,6 @@ from pathlib import Path
 import numpy as np
 
 from eval.light_scale import COVERED, fitted_factor
-from tron.apps.relight.camera_files import filmed_with
 from tron.captures import Capture
 from tron.captures.folder import read_capture_folder
 from tron.color import to_display
@@ -24,6 +23,7 @@ from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
 from tron.relighting import Illumination, Relighter
 from tron.report.page import Picture, Pictures
+from tron.scans.camera_files import filmed_with
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.guidance import Guidance

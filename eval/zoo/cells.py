@@ -113,8 +113,8 @@ def measured(
         scene = shape.surfels(material)
         root = integer(seed, "zoo", "light", shape.kind, shape.number)
         choice = "always" if shape.fog else "never"
-        relighter = first.changed(scene) if first else Relighter(scene, PREVIEW, root, proxy=choice)
-        first = first or relighter.prepare()
+        first = first or Relighter(scene, PREVIEW, root, proxy=choice).prepare()
+        relighter = first if scene is first.scene else first.changed(scene)
         meshes = [textured(part, f"part{n}").shape for n, part in enumerate(shape.of(material))]
         albedo = relighter.surface_maps(shape.camera, *QUALITIES.values()) if oidn else []
         for place, light in enumerate(lights):
@@ -125,9 +125,8 @@ def measured(
             truth = path_traced(
                 meshes, light.environment, shape.camera, depth, paths, integer(seed, *names, "truth")
             )
-            under = relighter.still_under(baked[light.name]) if number else relighter.under(light.lighting)
-            if not number:
-                baked[light.name] = under
+            under = relighter.bring(scene, light.lighting, before=baked.get(light.name))
+            baked.setdefault(light.name, under)
             exposure = light.environment.exposure()
             cell = Cell(shape.kind, shape.number, material, light.name, exposure, share, truth, {})
             for k, (quality, estimation) in enumerate(QUALITIES.items()):

@@ -8,7 +8,6 @@ import plyfile
 import pytest
 from PIL import Image
 
-from tron.apps.relight.camera_files import filmed_cameras, in_frame_of, read_cameras, write_cameras
 from tron.cameras import Camera, opencv_to_opengl
 from tron.captures import load_capture
 from tron.captures.folder import write_capture
@@ -16,6 +15,7 @@ from tron.captures.view import View
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.local_frame import LARGE, ORIGIN, local_origin
+from tron.scans.camera_files import filmed_cameras, in_frame_of, read_cameras, write_cameras
 from tron.seeds import generator
 
 WIDTH, HEIGHT, FOCAL = 32, 24, 40.0

@@ -6,9 +6,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from tron.apps.relight.camera_files import filmed_with
 from tron.framing import upright
 from tron.gaussians.scene import GaussianScene
+from tron.scans.camera_files import filmed_with
 from tron.seeds import generator
 
 SIDE = 48

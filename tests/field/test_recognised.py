@@ -17,13 +17,13 @@ import pytest
 from PIL import Image
 
 from tron.apps.reconstruct.command import cli as reconstruct
-from tron.apps.relight.camera_files import read_cameras
 from tron.apps.relight.command import cli as relight
 from tron.cameras import Camera
 from tron.captures import load_capture
 from tron.captures.load import FORMATS
 from tron.errors import TronError
 from tron.gaussians.formats.registry import check_header, refuse_foreign
+from tron.scans.camera_files import read_cameras
 
 METASHAPE = '<?xml version="1.0" encoding="UTF-8"?>\n<document version="2.0.0">\n  <chunk label="Chunk 1">\n'
 REALITY = "#name,x,y,alt,heading,pitch,roll,f,px,py,k1,k2,k3,k4,t1,t2\nIMG_0000.jpg,1,2,3,0,0,0,26,0,0,0\n"

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 
 from tron.apps.reconstruct.splat_capture import SplatSettings, film_splats
-from tron.apps.surroundings import treat_surroundings
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.framing import even_directions
@@ -14,6 +13,7 @@ from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import quats_from_normals
 from tron.reconstruction.settings import FusionSettings
 from tron.relighting import EnvironmentMap, Relighter
+from tron.scans.surroundings import treat_surroundings
 from tron.seeds import generator
 from tron.tracing.surroundings import find_surroundings
 

@@ -83,9 +83,9 @@ ASKED_FOR = {
     ("tron.apps.relight.clip", "tron.neural.renderer"),
     ("tron.view.opening", "tron.neural.weights"),  # where the extra `network` is installed
     ("tron.view.finishing", "tron.neural.renderer"),
-    ("tron.apps.relight.scan_materials", "tron.reconstruction.film"),
-    ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.carried"),
-    ("tron.apps.relight.scan_materials", "tron.reconstruction.materials.joint_fit"),
+    ("tron.scans.materials", "tron.reconstruction.film"),
+    ("tron.scans.materials", "tron.reconstruction.materials.carried"),
+    ("tron.scans.materials", "tron.reconstruction.materials.joint_fit"),
     ("tron.gaussians.formats.checkpoints", "torch"),  # where a scene is one: the extra `network`
     ("tron.editing.models", "tron.models.load"),  # where a mesh is put in: the extra `models`
     ("tron.editing.models", "tron.models.surfels"),

@@ -45,7 +45,8 @@ def test_the_python_examples_do_what_they_say(tmp_path, monkeypatch):
     (six,) = re.findall(r"```python\n(.*?)```", README.read_text(), re.DOTALL)
     assert len(six.strip().replace("\n\n", "\n").splitlines()) == 6
     first, second = re.findall(r"```python\n(.*?)```", PYTHON.read_text(), re.DOTALL)
-    surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / "scene.ply")
+    for name in ("scan", "scene"):
+        surfels_from_gbuffers([plane_view()], count=500).save(tmp_path / f"{name}.ply")
     write_image(tmp_path / "studio.hdr", np.full((16, 32, 3), 0.7, np.float32))
     monkeypatch.chdir(tmp_path)
     for code in (six.replace("-45", "-45, width=24, height=24"), first.replace("512", "24")):

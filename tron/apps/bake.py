@@ -10,23 +10,19 @@ from typing import Annotated, Literal
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.capture_light import over_scene
-from tron.apps.relight.camera_files import filmed_orbit, filmed_with
-from tron.apps.relight.scan_materials import proxy_file, with_materials
-from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
+from tron.apps.scene_file import SURROUNDINGS, FoundMaterials, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
-from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.color import Look
-from tron.estimation import PREVIEW
-from tron.framing import upright
 from tron.gaussians.formats.registry import WRITTEN
-from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import check_count, check_suffix, write_splats
 from tron.runtime import Threads, Variant, activate
+from tron.scans import Scan
+from tron.scans.camera_files import filmed_orbit
+from tron.scans.surroundings import Treatment
 from tron.trajectories import plan_cameras
 
 log = logging.getLogger(__name__)
@@ -58,14 +54,12 @@ class Settings(BaseModel):
         description="factor before the tone curve; auto: metered as by tron-relight, which the log says",
     )
     look: Look = Field("photograph", description="tone: AgX with the contrast that photographs have, or none")
-    surroundings: Treatment = Field("drop", description=DESCRIPTION)
+    surroundings: Treatment = Field("drop", description=SURROUNDINGS)
     proxy: Literal["auto", "always", "never"] = Field(
         "auto", description="what light sees of a scan, as of tron-relight"
     )
     projection: SeenAs = "auto"
-    materials: Literal["auto", "as_is"] = Field(
-        "auto", description="of a scan without any, as of tron-relight: found and kept, or guessed"
-    )
+    materials: FoundMaterials = "auto"
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"
@@ -81,7 +75,6 @@ def main(settings: Settings) -> None:
     """
     # Mitsuba: not for --help or a mistyped key
     from tron.relighting.baking import baked
-    from tron.relighting.relighter import Relighter
     from tron.shading.environments.environment import EnvironmentMap
 
     check_suffix(settings.output)
@@ -89,37 +82,28 @@ def main(settings: Settings) -> None:
     with working("reading the light and the scene"):
         environment = EnvironmentMap.load(settings.environment)
         activate(settings.variant, settings.threads)
-        scene = load_scene(settings.scene, settings.up, settings.materials, settings.projection)
-    check_count(settings.output, len(scene))
-    turn, offset = upright(scene.up), scene.offset
-    environment = over_scene(environment, settings.environment, settings.scene, turn)
-    scene = scene.upright()  # +z is up in environment maps
-    surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
-    scene = surrounded.shown
-    filmed = filmed_with(settings.scene, turn, offset, surrounded.content)
-    kept = KeptFiles(settings.scene, settings.output.parent)
-    if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)
-    never = settings.proxy == "never"
-    relighter = Relighter(
-        scene, PREVIEW, settings.seed, backdrop=surrounded.backdrop, proxy=settings.proxy,
-        cameras=filmed, proxy_file=None if never else proxy_file(scene, kept, filmed, surrounded.backdrop),
-        track=partial(track, label="light between surfels"), filming=partial(track, label="filming the scan"),
-    )  # fmt: skip
+        scan = Scan.open(
+            settings.scene, up=settings.up, projection=settings.projection, materials=settings.materials,
+            surroundings=settings.surroundings, seed=settings.seed, apart=settings.output.parent, track=track,
+        )  # fmt: skip
+    check_count(settings.output, len(scan.loaded))
+    environment = scan.over(environment, settings.environment)
+    # Splats hold no ground, and light that falls on the subject is metered.
+    relighter = scan.relighter(proxy=settings.proxy, ground=None)
     light = relighter.under(environment.rotated(settings.rotation))
     exposure = settings.exposure
     if exposure == "auto":
-        camera = _front(surrounded.content, filmed)
+        camera = _front(scan.content, scan.filmed)
         exposure = light.render(camera, settings.seed).exposure(settings.look)
         log.info(
             "exposure %.4g, metered; exposure=%.4g keeps it, twice as much is a stop brighter",
             exposure, exposure,
         )  # fmt: skip
     lit = baked(light, exposure, settings.look, partial(track, label="baking"))
-    if not np.allclose(turn, np.eye(3)):
-        lit = lit.rotated(turn.T)
+    if not np.allclose(scan.turn, np.eye(3)):
+        lit = lit.rotated(scan.turn.T)
     write_splats(settings.output, lit)
-    smooth = float((scene.roughness < MIRRORING).mean())
+    smooth = float((scan.scene.roughness < MIRRORING).mean())
     if smooth > 0:
         log.info(
             "%.0f %% of the surfels have a roughness below %.1f: their reflections are blurred, since "

@@ -11,18 +11,17 @@ from typing import Annotated
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.capture_light import LIGHT
-from tron.apps.relight.camera_files import CAMERAS, in_frame_of
-from tron.apps.relight.scan_materials import with_known_materials
-from tron.apps.scene_file import Up, check_scene_files, load_scene
+from tron.apps.scene_file import FoundMaterials, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import ANEW, command
-from tron.cli.progress import working
+from tron.cli.progress import track, working
 from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
-from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.io.cameras.registry import cameras_of
+from tron.scans import Scan
+from tron.scans.camera_files import CAMERAS, in_frame_of
+from tron.scans.scan import LIGHT
 from tron.storage import write_atomic
 
 log = logging.getLogger(__name__)
@@ -50,6 +49,7 @@ class Settings(BaseModel):
         description="JSON of the views that edits pick pixels or give masks in, as tron-relight takes it, or "
         "a folder with a cameras.json or transforms.json; null: cameras.json beside the scene",
     )
+    materials: FoundMaterials = "auto"
     up: Up = None
 
 
@@ -74,9 +74,9 @@ def main(settings: Settings) -> None:
     What else selects: material (ranges), grow (from a picked surfel or pixel), clicks (inside and outside),
     masks (of views). Several together hold at once; any joins selections, but_not takes one away.
 
-    Writes the scene with the edits done, or nothing. What is known of the scene stays known: its up, the
-    materials that tron-relight found, and in another folder its cameras.json and environment.exr. The same
-    is in Python: tron.editing.
+    Writes the scene with the edits done, or nothing. What is known of the scene stays known: its up, its
+    materials, which are found first as by tron-relight, and in another folder its cameras.json and
+    environment.exr. The same is in Python: tron.editing.
     """
     if settings.output.suffix.lower() != ".ply":
         mend = "give it a name that ends with .ply; tron-export makes other files of that"
@@ -84,16 +84,18 @@ def main(settings: Settings) -> None:
     check_scene_files(settings.scene, settings.output, *_files(settings), _cameras_file(settings))
     edits, where = _read(settings)
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up)
-    if scene.materials_guessed:
-        scene = with_known_materials(scene, KeptFiles(settings.scene, settings.output.parent))
+        scan = Scan.open(
+            settings.scene, up=settings.up, materials=settings.materials, apart=settings.output.parent,
+            track=track, key="",
+        )  # fmt: skip
+    scene = scan.in_file
     _describe(scene)
     if scene.offset.any():
         log.info("coordinates of edits are about %s", scene.offset.tolist())
     if scene.materials_guessed and any(isinstance(each, Insert | Material) for each in edits):
         log.warning(
-            "%s has no materials of its own: tron-relight would find them anew and undo these edits; relight "
-            "the scan first, which keeps what it finds, or give it materials=as_is", settings.scene,
+            "%s has no materials of its own: tron-relight would find them and undo these edits; give it "
+            "materials=as_is too", settings.scene,
         )  # fmt: skip
     edited = edits.apply(scene, _views(settings, scene), where, _said)
     edited.save(settings.output)

@@ -9,15 +9,12 @@ from typing import Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.relight.camera_files import filmed_with, in_frame_of
-from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files, load_scene
+from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files
 from tron.apps.splat_file import SceneFile
-from tron.apps.surroundings import treat_surroundings
 from tron.cli.command_line import ANEW, command
 from tron.cli.installation import loading
 from tron.cli.progress import track, working
 from tron.errors import TronError
-from tron.framing import upright
 from tron.gaussians.edit import KERNEL_WIDTHS
 from tron.gaussians.formats.registry import WRITTEN
 from tron.gaussians.scene import GaussianScene
@@ -25,6 +22,8 @@ from tron.gaussians.splat_files import check_suffix, write_points, write_splats
 from tron.io.cameras.registry import UPRIGHT, cameras_of, check_camera_file, write_camera_file
 from tron.io.local_frame import moved_cameras
 from tron.runtime import Threads, Variant, activate
+from tron.scans import Scan
+from tron.scans.camera_files import in_frame_of
 from tron.trajectories import turn_cameras
 
 log = logging.getLogger(__name__)
@@ -98,14 +97,13 @@ def _write_cameras(settings: Settings, file: Path) -> None:
     check_output(settings.output, file, "the file of cameras")
     cameras = cameras_of(file, fps=settings.fps)
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, "as_is")
-    cameras = in_frame_of(scene.offset, cameras, file)
+        scan = Scan.open(settings.scene, up=settings.up, materials="as_is")
+    cameras = in_frame_of(scan.offset, cameras, file)
     stands, wanted = (path.suffix.lower() in UPRIGHT for path in (file, settings.output))
     if stands != wanted:
-        turn = upright(scene.up)
-        cameras = turn_cameras(cameras, turn if wanted else turn.T)
+        cameras = turn_cameras(cameras, scan.turn if wanted else scan.turn.T)
     if not wanted:
-        cameras = moved_cameras(cameras, scene.offset)
+        cameras = moved_cameras(cameras, scan.offset)
     write_camera_file(settings.output, cameras, settings.fps)
     log.info("%d cameras: %s", len(cameras), settings.output)
 
@@ -141,11 +139,8 @@ def _write_mesh(settings: Settings) -> None:
         what = f"{error.name} is not installed, which makes meshes"
         raise TronError(what, mend="pip install 'tron-relight[relight,models]'") from error
     activate(settings.variant, settings.threads)
-    scene = load_scene(settings.scene, settings.up, "as_is", settings.projection)
-    turn, offset = upright(scene.up), scene.offset
-    scene = treat_surroundings(scene.upright(), "drop", settings.scene).content
-    filmed = filmed_with(settings.scene, turn, offset, scene)
-    tracer, views = SurfelTracer(scene), views_of(scene, filmed)
+    scan = Scan.open(settings.scene, up=settings.up, projection=settings.projection, materials="as_is")
+    tracer, views = SurfelTracer(scan.scene), views_of(scan.scene, scan.filmed)
     surface = surface_of(tracer, views, triangles=settings.triangles, track=partial(track, label="surface"))
     part = textured(tracer, surface, settings.texture, track)
     with working("writing"):

@@ -1,22 +1,16 @@
-"""A scene's file as commands take and write it: its up, and what is guessed."""
+"""A scene's file as commands take and write it: checks of it, and settings of how it is opened."""
 
 from __future__ import annotations
 
-import logging
 import math
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import AfterValidator, Field
 
 from tron.errors import TronError
 from tron.gaussians.formats.registry import check_header, refuse_foreign
-from tron.gaussians.scene import GaussianScene
 from tron.io.recognised import refuse_by_sight
-
-log = logging.getLogger(__name__)
 
 
 def _has_a_length(up: tuple[float, float, float] | None) -> tuple[float, float, float] | None:
@@ -42,6 +36,24 @@ SeenAs = Annotated[
     ),
 ]
 """Setting of how splats are projected."""
+FoundMaterials = Annotated[
+    Literal["auto", "as_is"],
+    Field(
+        description="of a scan without any; auto: found once with the light it was captured in, which is "
+        "taken out of its colours, and kept as NAME.materials.ply where its proxy is; as_is: guessed from "
+        "its colours"
+    ),
+]
+"""Setting of a plain scan's materials."""
+GROUND = (
+    "level plane that shows the environment's ground and shadows of what stands there; auto: below a thing "
+    "that has no floor of its own; or its height along up, in the scene's units"
+)
+SURROUNDINGS = (
+    "splats far around the scene that shut out the light, such as a shell of sky: drop leaves them out; "
+    "background shows them behind the scene, lit, but frames nothing by them and has no shadow nor bounce of "
+    "theirs; keep treats them as all others. Walls of rooms and distant hills are none"
+)
 
 
 def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
@@ -72,40 +84,3 @@ def check_output(output: Path, source: Path, what: str) -> None:
         raise TronError("output is a folder", output, "give a file in it")
     if output.exists() and output.samefile(source):
         raise TronError(f"output is {what} itself", output, "give another name")
-
-
-def load_scene(
-    path: Path,
-    up: Sequence[float] | None,
-    materials: Literal["auto", "as_is"] = "auto",
-    projection: Literal["auto", "disks"] = "auto",
-) -> GaussianScene:
-    """The scene of a file, with a line in the log where its materials or which way is up are guessed.
-
-    What is up is settled by that: files that are made of the scene say so, and nobody is warned again.
-
-    Args:
-        path: the PLY.
-        up: direction of any length, in the file's frame; None: the file's own.
-        materials: that are guessed are not looked for (as_is).
-        projection: the file's (auto), or disks in space.
-    """
-    scene = GaussianScene.load(path)
-    if projection != "auto":
-        scene.projection = projection
-    if scene.materials_guessed and materials == "as_is":
-        log.warning(
-            "%s has no materials%s: they are guessed from its colours, which keep the light that it was "
-            "captured in",
-            path, "" if scene.oriented else " and normals without a sign",
-        )  # fmt: skip
-    if up is not None:
-        scene.up = np.array(up) / np.linalg.norm(up)
-    elif scene.up_guessed:
-        log.warning(
-            "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on its "
-            "side, give up=[0,0,1] or another direction",
-            path,
-        )
-    scene.up_guessed = False
-    return scene

@@ -9,15 +9,15 @@ from typing import TYPE_CHECKING
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.capture_light import is_of_capture, over_scene
-from tron.apps.scene_file import SeenAs, Up, check_scene_files, load_scene
+from tron.apps.scene_file import GROUND, FoundMaterials, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import command
-from tron.cli.progress import working
+from tron.cli.progress import track, working
 from tron.errors import TronError
-from tron.framing import upright
 from tron.io.lights import LIGHT_SUFFIXES
 from tron.runtime import Threads, Variant, activate
+from tron.scans import Scan
+from tron.scans.scan import GroundChoice, is_of_capture
 
 if TYPE_CHECKING:
     from tron.view.window import Window
@@ -51,7 +51,9 @@ class Settings(BaseModel):
         "127.0.0.1", description="address to listen on; 0.0.0.0 lets in everybody who reaches it"
     )
     port: int = Field(8080, ge=1, le=65535, description="port to listen on")
+    ground: GroundChoice = Field("auto", description=GROUND)
     projection: SeenAs = "auto"
+    materials: FoundMaterials = "auto"
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"
@@ -103,13 +105,15 @@ def opened(settings: Settings) -> Window:
     require_free_port(settings.host, settings.port)
     activate(settings.variant, settings.threads)
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, "as_is", settings.projection)
-        home, turn = home_of(scene), upright(scene.up)
-        turned = {k: over_scene(EnvironmentMap.load(f), f, settings.scene, turn) for k, f in own.items()}
+        scan = Scan.open(
+            settings.scene, up=settings.up, projection=settings.projection, materials=settings.materials,
+            seed=settings.seed, apart=output, track=track, key="",
+        )  # fmt: skip
+        turned = {name: scan.over(EnvironmentMap.load(file), file) for name, file in own.items()}
     return Window(
-        scene, settings.scene, lights, models, output, settings.host, settings.port, home, turned, first,
-        seed=settings.seed, variant=settings.variant, threads=settings.threads,
-        finish=finish_of(settings.threads),
+        scan.in_file, settings.scene, lights, models, output, settings.host, settings.port,
+        home_of(scan.loaded), turned, first, about=scan.about(settings.ground), seed=scan.root,
+        variant=settings.variant, threads=settings.threads, finish=finish_of(settings.threads),
     )  # fmt: skip
 
 

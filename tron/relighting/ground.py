@@ -11,7 +11,7 @@ No light is sent up from the plane to the scene: the map's lower half does that,
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, fields
 
 import drjit as dr
@@ -42,21 +42,6 @@ class Ground:
 
     height: float
     eye: tuple[float, float, float]
-
-    @classmethod
-    def under(cls, scene: GaussianScene, camera: Camera, height: float | None = None) -> Ground:
-        """The plane that a scene stands on, seen from as high as a camera is.
-
-        Args:
-            scene: with z up.
-            camera: the first of a clip.
-            height: of the plane, world units; None: the lowest surfels', strays apart.
-        """
-        subject = find_subject(scene)
-        if height is None:
-            height = foot_height(scene.means[:, 2], scene.opacity_logits)
-        rise = max(float(camera.position[2]) - height, _LEAST_EYE * subject.radius)
-        return cls(height, (float(subject.centre[0]), float(subject.centre[1]), height + rise))
 
     def behind(
         self,
@@ -96,13 +81,46 @@ class Ground:
         return dr.select(seen, radiance * share, radiance)
 
 
-def stands_free(scene: GaussianScene, cameras: Sequence[Camera]) -> bool:
-    """Whether a scene, z up, is a thing without a floor of its own that all cameras see from without."""
-    if has_floor(scene):
-        return False
-    subject = find_subject(scene)
-    lowest = Ground.under(scene, cameras[0]).height
-    return all(
-        camera.position[2] > lowest and np.linalg.norm(camera.position - subject.centre) > subject.radius
-        for camera in cameras
-    )
+GroundOf = Ground | Callable[[Camera], Ground | None] | None
+"""What a scene stands on, if anything; or what says that of each camera."""
+
+
+@dataclass(frozen=True)
+class Footing:
+    """How a scene, z up, stands: found once, for all cameras.
+
+    Attributes:
+        floor: whether it has a floor of its own.
+        centre, radius: of its subject, world units.
+        height: of its lowest surfels, strays apart.
+    """
+
+    floor: bool
+    centre: np.ndarray
+    radius: float
+    height: float
+
+    @classmethod
+    def of(cls, scene: GaussianScene) -> Footing:
+        """That of a scene with z up."""
+        subject = find_subject(scene)
+        height = foot_height(scene.means[:, 2], scene.opacity_logits)
+        return cls(has_floor(scene), subject.centre, subject.radius, height)
+
+    def free(self, cameras: Sequence[Camera]) -> bool:
+        """Whether it is a thing without a floor of its own that all cameras see from without."""
+        return not self.floor and all(
+            camera.position[2] > self.height and np.linalg.norm(camera.position - self.centre) > self.radius
+            for camera in cameras
+        )
+
+    def ground(self, camera: Camera, height: float | None = None) -> Ground:
+        """The plane that it stands on, seen from as high as a camera is.
+
+        Args:
+            camera: the first of a clip.
+            height: of the plane, world units; None: the lowest surfels'.
+        """
+        height = self.height if height is None else height
+        rise = max(float(camera.position[2]) - height, _LEAST_EYE * self.radius)
+        return Ground(height, (float(self.centre[0]), float(self.centre[1]), height + rise))

@@ -4,7 +4,7 @@
     light = relighter.under(EnvironmentMap.load("studio.hdr").rotated(90))   # bakes once
     frame = light.render(camera)
     frame.write("lit.png")                                                   # exposed, AgX
-    moved = relighter.changed(scene2)                                        # retraces only what has to be
+    moved = relighter.bring(scene2, light.lighting, before=light)            # redoes only what has to be
 
 What bounces depends on the scene, traced once, and on the light and its turn, baked for each; not on the
 camera. One :class:`Estimation` reaches the tracer's sides, the rays between surfels, the bake and the frames.
@@ -35,7 +35,7 @@ from tron.estimation import FINAL, Estimation
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
 from tron.relighting.beside import BesideMeshes, LightTracer, some_of
-from tron.relighting.ground import Ground
+from tron.relighting.ground import GroundOf
 from tron.relighting.proxy import THICK, Choice, ProxiedTracer, Proxy, fingerprint, make_proxy, thickness
 from tron.runtime import activate
 from tron.shading.bounces.bounce import BouncedLight, BounceTransport
@@ -79,7 +79,8 @@ class Relighter:
         cameras: that the scene was filmed with, to film its proxy; None: from around it.
         proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
         filming: wraps the loop over the proxy's views, to show progress.
-        ground: what the scene stands on and throws shadows on, where frames show the environment.
+        ground: what the scene stands on and throws shadows on, where frames show the environment; or what
+            says that of each camera.
         meshes: models, each as :func:`tron.models.load.load_model` reads it, where they stand, in the scene's
             world and units: opaque things beside the surfels (:mod:`tron.tracing.meshes`).
     """
@@ -96,7 +97,7 @@ class Relighter:
         cameras: Sequence[Camera] | None = None,
         proxy_file: Path | None = None,
         filming: Callable[[range], Iterable[int]] = iter,
-        ground: Ground | None = None,
+        ground: GroundOf = None,
         meshes: Sequence[Sequence[Part]] = (),
     ) -> None:
         if mi.variant() is None:
@@ -106,6 +107,8 @@ class Relighter:
         self._choice, self._cameras, self._proxy_file, self._filming = proxy, cameras, proxy_file, filming
         self._tracer = SurfelTracer(scene, backdrop=backdrop).sided(estimation.two_sided)
         self._turned_to: tuple[bytes, SurfelTracer] | None = None
+        self.frame_seed = 0  # of frames that are given none
+        self._refitted = False  # whether something has moved in the hierarchy
         self.meshes = Meshes(meshes, seed) if meshes else None
 
     def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
@@ -157,6 +160,12 @@ class Relighter:
             except TronError as error:
                 log.info("the proxy is not kept: %s", error)
         return made
+
+    @property
+    def _stays(self) -> Choice:
+        """Whether light sees a proxy of what becomes of the scene: as it does of this one."""
+        always = self._choice == "always" or (self._choice != "never" and self.proxy is not None)
+        return "always" if always else "never"
 
     def _needs_proxy(self, tracer: SurfelTracer) -> tuple[bool, str]:
         """Whether light sees a proxy, and why, in words; empty words where nobody has to know."""
@@ -247,32 +256,83 @@ class Relighter:
         if self.estimation.bounces:
             bake = self.transport.bake_quickly if quick else self.transport.bake
             baked = self._seen(bake(lighting, self.estimation, seed=seed))
-        return Illumination(self, lighting, self.estimation, seed, baked)
+        return Illumination(self, lighting, self.estimation, seed, baked, quick)
 
     def _seen(self, baked: BouncedLight) -> BouncedLight:
         if self._proxied is None and not self.scene.oriented:  # a camera may see the side that was not baked
             return replace(baked, reaching=None)
         return baked
 
-    def still_under(self, before: Illumination) -> Illumination:
-        """:meth:`under` the light of a scene whose materials alone were others: its shadows stay, to the bit.
+    def bring(
+        self,
+        scene: GaussianScene,
+        light: Light,
+        rotation: float | None = None,
+        *,
+        before: Illumination | None = None,
+        seed: int | None = None,
+        quick: bool = False,
+        anew: bool = False,
+        proxy: Proxy | None = None,
+        meshes: Meshes | None = None,
+    ) -> Illumination:
+        """A scene under a light, with no more work than it asks for beside what is there.
 
-        Where more than that differs, all is baked anew.
+        ================  =============  ===============================================================
+        scene             light          what is done
+        ================  =============  ===============================================================
+        this one's        ``before``'s   nothing
+        this one's        another        a bake
+        other materials   ``before``'s   what bounces is followed again: shadows stay, to the bit
+        other materials   another        a bake
+        moved             any            a refit, rays that have changed, a bake (:meth:`changed`)
+        any other         any            all
+        ================  =============  ===============================================================
+
+        Args:
+            scene: this relighter's, or another.
+            light: an environment, or one that is prepared; the same object as before where it is the same.
+            rotation: of it about +z, degrees; None: as it is.
+            before: what there is; of the same light, whatever the scene, or of another.
+            seed: root of the shadow rays of surfels; None: the relighter's.
+            quick: as it is looked at while something moves: few rays of surfels. Where its proxy would have
+                to be made anew, the scene stays where it is.
+            anew: not a ray as something moved has left it: as if nothing had been before.
+            proxy, meshes: as of :meth:`changed`.
         """
-        baked = before.bounced
-        if baked is None or not self._stands_like(before.relighter):
-            return self.under(before.lighting, before.seed)
-        baked = self._seen(self.transport.rebaked(baked, self.estimation))
-        return Illumination(self, before.lighting, self.estimation, before.seed, baked)
+        relighter, stands = self, self._stands_as(scene)
+        same = scene is self.scene and (meshes is None or meshes is self.meshes)
+        if anew and (self._refitted or not stands):
+            relighter = self._anew(scene, self._stays, meshes).prepare()
+        elif not same and not (quick and not stands and proxy is None and self.proxy is not None):
+            relighter = self.changed(scene, quick=quick, proxy=proxy, meshes=meshes)
+        return relighter._under(light, rotation, before, relighter.seed if seed is None else seed, quick)
+
+    def _under(
+        self, light: Light, rotation: float | None, before: Illumination | None, seed: int, quick: bool
+    ) -> Illumination:
+        """This scene under a light, of which ``before`` may have a bake."""
+        turn = None if rotation is None else rotation % 360
+        if before is not None and before.seed == seed and (quick or not before.quick):
+            given = before.lighting if before.source is None else before.source
+            if given is light and before.turn == turn:
+                if before.relighter is self:
+                    return before
+                if before.bounced is not None and self._stands_like(before.relighter):
+                    baked = self._seen(self.transport.rebaked(before.bounced, self.estimation))
+                    return replace(before, relighter=self, estimation=self.estimation, bounced=baked)
+        lighting = light if isinstance(light, Lighting) else Lighting(light)
+        lighting = lighting if rotation is None else lighting.turned_to(rotation)
+        return replace(self.under(lighting, seed, quick=quick), source=light, turn=turn)
 
     def _stands_like(self, other: Relighter) -> bool:
         """Whether surfels and the light's rays among them are those of another relighter."""
         traced = (self._surfels_of_light.bvh.order, self.estimation, self.seed)
         others = (other._surfels_of_light.bvh.order, other.estimation, other.seed)
         alike = traced[0] is others[0] and traced[1:] == others[1:] and self.meshes is other.meshes
-        return self.stands_as(other.scene) and alike
+        return self._stands_as(other.scene) and alike
 
-    def stands_as(self, scene: GaussianScene) -> bool:
+    def _stands_as(self, scene: GaussianScene) -> bool:
         """Whether a scene is this one but for materials and radiance."""
         return len(scene) == len(self.scene) and _same(self.scene, scene, (*REACH, "means", "quats"))
 
@@ -304,17 +364,13 @@ class Relighter:
         before = self.scene
         if self._backdrop is not None and len(scene) != len(self._backdrop):
             raise TronError("surfels have come or gone before a backdrop", mend="make a new Relighter")
-        choice: Choice | Proxy = "never" if self.proxy is None else proxy or "always"
-        stands = self.stands_as(scene)
+        choice: Choice | Proxy = proxy if proxy is not None and self.proxy is not None else self._stays
+        stands = self._stands_as(scene)
         painted = self.proxy if stands and proxy is None else None
         if not _same(scene, before, REACH) or (painted is None and self.proxy is not None):
-            anew = Relighter(
-                scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
-                proxy=choice, cameras=self._cameras, filming=self._filming, ground=self.ground,
-            )  # fmt: skip
-            anew.meshes = meshes or self.meshes
-            return anew
+            return self._anew(scene, choice, meshes)
         other = copy(self)
+        other._refitted = self._refitted or not stands
         other.meshes = meshes or self.meshes
         other.__dict__.pop("_beside", None)
         other.scene, other._tracer, other._turned_to = scene, self._tracer.moved(scene), None
@@ -332,6 +388,15 @@ class Relighter:
             other.__dict__["transport"] = carried(other._light)
         return other
 
+    def _anew(self, scene: GaussianScene, proxy: Choice | Proxy, meshes: Meshes | None) -> Relighter:
+        """A new relighter of another scene; what is kept of the scan is not of that."""
+        anew = Relighter(
+            scene, self.estimation, self.seed, backdrop=self._backdrop, track=self._track,
+            proxy=proxy, cameras=self._cameras, filming=self._filming, ground=self.ground,
+        )  # fmt: skip
+        anew.meshes, anew.frame_seed = meshes or self.meshes, self.frame_seed
+        return anew
+
 
 @dataclass(frozen=True)
 class Illumination:
@@ -343,6 +408,8 @@ class Illumination:
         estimation: of frames: the relighter's but for what :meth:`framed` has changed.
         seed: root of the shadow rays of surfels.
         bounced: the bake, at the surfels that light sees; None where nothing bounces.
+        quick: whether the bake is of few rays.
+        source, turn: what :meth:`Relighter.bring` was given as the light; None: the environment, as it is.
     """
 
     relighter: Relighter
@@ -350,6 +417,9 @@ class Illumination:
     estimation: Estimation
     seed: int
     bounced: BouncedLight | None
+    quick: bool = False
+    source: Light | None = None
+    turn: float | None = None
 
     def turned_to(self, rotation_deg: float) -> Illumination:
         """The same environment at another rotation about +z: baked, not prepared again.
@@ -371,22 +441,25 @@ class Illumination:
         given = {"rays": rays, "filtered": filtered, "reflections": reflections, "supersample": supersample}
         wanted: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         other = Estimation.model_validate(self.estimation.model_dump() | wanted)
-        return Illumination(self.relighter, self.lighting, other, self.seed, self.bounced)
+        return replace(self, estimation=other)
 
-    def trace(self, camera: Camera, seed: int = 0, view: GBuffer | None = None) -> TracedFrame:
+    def trace(self, camera: Camera, seed: int | None = None, view: GBuffer | None = None) -> TracedFrame:
         """Trace all rays of a frame; see :meth:`render`."""
+        seed = self.relighter.frame_seed if seed is None else seed
         tracer, bounce = self.relighter.tracer(camera), self.bounced
         if view is None:
             (view,) = trace_views(tracer, camera, self.estimation, [bounce])
         arriving = arriving_light(tracer, view, self.lighting, self.estimation, seed, bounce)
-        if ground := self.relighter.ground:
+        ground = self.relighter.ground
+        ground = ground(camera) if callable(ground) else ground
+        if ground is not None:
             arriving.behind = ground.behind(tracer, view, camera, self.lighting, self.estimation, seed)
         return TracedFrame(self.lighting, self.estimation, view, arriving)
 
     def render(
         self,
         camera: Camera,
-        seed: int = 0,
+        seed: int | None = None,
         background: Sequence[float] | None = None,
         view: GBuffer | None = None,
         denoise: Literal["oidn"] | None = None,
@@ -395,7 +468,7 @@ class Illumination:
 
         Args:
             camera: the view.
-            seed: root of the random numbers of its rays.
+            seed: root of the random numbers of its rays; None: the relighter's ``frame_seed``, which is 0.
             background: linear RGB radiance behind the surfels; None: the environment.
             view: what the camera sees, where it is traced already (:func:`views_under`).
             denoise: "oidn": as :meth:`TracedFrame.denoised`.

@@ -164,7 +164,7 @@ def show(
         Window(
             scene, file, maps, inserted, folder, host, port, home_of(scene),
             light=first_light(maps, light, (), where), seed=relighter.seed, variant=variant,
-            threads=threads, finish=finish_of(threads),
+            threads=threads, finish=finish_of(threads), about={"ground": relighter.ground},
         ),
         height,
     )  # fmt: skip

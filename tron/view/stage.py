@@ -10,7 +10,7 @@ from __future__ import annotations
 from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Any, Literal, get_args
 
 import drjit as dr
 import numpy as np
@@ -24,7 +24,6 @@ from tron.framing import upright
 from tron.gaussians.edit import removed
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Relighter
-from tron.relighting.proxy import Choice
 from tron.relighting.relighter import Illumination
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
@@ -130,29 +129,6 @@ def bands(camera: Camera) -> list[Camera]:
     ]
 
 
-class _Lit:
-    """A relighter under one light, baked no more than it has to be."""
-
-    def __init__(self) -> None:
-        self.illumination: Illumination | None = None
-        self.settled = False
-        self._light: tuple[str, float] | None = None
-
-    def bring(
-        self, relighter: Relighter, lighting: Lighting, name: str, turn: float, seed: int, rough: bool
-    ) -> None:
-        """Bake what is another than before: of few rays, if ``rough``."""
-        now, light = self.illumination, (name, turn % 360)
-        if now is not None and self._light == light and (rough or self.settled):
-            if now.relighter is relighter:
-                return
-            if relighter.stands_as(now.relighter.scene):
-                self.illumination = relighter.still_under(now)
-                return
-        self.illumination = relighter.under(lighting.turned_to(turn), seed, quick=rough)
-        self._light, self.settled = light, not rough
-
-
 class Stage:
     """A scene, its edits and its lights; of one thread.
 
@@ -163,6 +139,8 @@ class Stage:
         seed: root of all random numbers.
         watch: called between pieces of long work that may be given up; it raises then.
         busy: called with what long work is about, and the share of it that is done.
+        about: more arguments of the :class:`tron.relighting.Relighter` of the scene as it was opened, such as
+            its ground, its cameras and where its proxy is kept.
     """
 
     def __init__(
@@ -173,18 +151,21 @@ class Stage:
         seed: int = 0,
         watch: Callable[[], None] = lambda: None,
         busy: Callable[[str, float], None] = lambda *_: None,
+        about: Mapping[str, Any] | None = None,
     ) -> None:
         self.session, self.turn = Session(scene), upright(scene.up)
         self._lights, self._seed, self._watch, self._busy = lights, seed, watch, busy
         self._home = home.resized(METERED, max(1, round(METERED * home.height / home.width)))
         self._original = scene
         self._yields = False  # whether what is under way may be given up
-        self._base = self._lit_anew(scene.upright(), "auto")
+        rays, film = self._watched("tracing light"), self._watched("filming the scan for light")
+        self._base = Relighter(scene.upright(), PREVIEW, seed, track=rays, filming=film, **(about or {}))
         self._prepared: dict[str, tuple[Lighting, float]] = {}
         self._shown: _Visible | None = None
         self._selected: tuple[GaussianScene, Clicks, np.ndarray] | None = None
-        self._relighter, self._fresh = self._base, True
-        self._right, self._left = _Lit(), _Lit()
+        self._relighter = self._base
+        self._right: Illumination | None = None
+        self._left: Illumination | None = None
 
     def bring(self, wish: Wish, rough: bool) -> None:
         """Do what is left to do for a wish.
@@ -198,13 +179,16 @@ class Stage:
         """
         lighting, _ = self._lighting(wish.light)
         other = self._lighting(wish.left_light)[0] if wish.left == "light" else lighting
-        self._yields = not rough and self._right.illumination is not None
-        self._relight(self._scene(wish), rough)
-        self._right.bring(self._relighter, lighting, wish.light, wish.turn, self._seed, rough)
+        self._yields = not rough and self._right is not None
+        how: dict[str, Any] = {"quick": rough, "anew": not rough}
+        scene, base = self._scene(wish), self._base
+        start = base if scene is base.scene else self._relighter
+        self._right = start.bring(scene, lighting, wish.turn, before=self._right, **how)
+        self._relighter = here = self._right.relighter
         if wish.left == "light":
-            self._left.bring(self._relighter, other, wish.left_light, 0.0, self._seed, rough)
+            self._left = here.bring(here.scene, other, 0.0, before=self._left, **how)
         elif wish.left == "before":
-            self._left.bring(self._base, lighting, wish.light, wish.turn, self._seed, rough)
+            self._left = base.bring(base.scene, lighting, wish.turn, before=self._left, **how)
         if wish.marked is not None:
             self.selected(wish.marked)
 
@@ -236,7 +220,7 @@ class Stage:
             rough: whether metals mirror no surfel, which takes a ray.
             more: other buffers of light.
         """
-        light = (self._left if part.left else self._right).illumination
+        light = self._left if part.left else self._right
         if number >= 0:
             dx, dy = SUB_PIXELS[number]
             camera = replace(camera, cx=camera.cx + dx, cy=camera.cy + dy)
@@ -364,29 +348,6 @@ class Stage:
             upright = self._base.scene if left is self._original else left.upright()
             self._shown = shown = _Visible(scene, hidden, which, left, upright)
         return shown
-
-    def _relight(self, scene: GaussianScene, rough: bool) -> None:
-        """Make a relighter of the scene: of moved surfels in the hierarchy that is there, if ``rough``."""
-        if scene is self._relighter.scene and (rough or self._fresh):
-            return
-        stays = self._relighter.stands_as(scene)
-        if scene is self._base.scene:
-            self._relighter, self._fresh = self._base, True
-        elif stays and (rough or self._fresh) and scene is not self._relighter.scene:
-            self._relighter = self._relighter.changed(scene)
-        elif rough and self._base.proxy is not None:
-            pass  # what moves in a scan does so once the hand rests: its proxy takes seconds
-        elif rough and len(scene) == len(self._relighter.scene):
-            self._relighter, self._fresh = self._relighter.changed(scene, quick=True), False
-        else:
-            # Prepared before it is taken: where a newer wish ends that, the one before it stays.
-            proxy = "never" if self._base.proxy is None else "always"
-            self._relighter, self._fresh = self._lit_anew(scene, proxy).prepare(), True
-            self._right.settled = self._left.settled = False
-
-    def _lit_anew(self, scene: GaussianScene, proxy: Choice) -> Relighter:
-        rays, film = self._watched("tracing light"), self._watched("filming the scan for light")
-        return Relighter(scene, PREVIEW, self._seed, proxy=proxy, track=rays, filming=film)
 
     def _surface(self, part: Part, camera: Camera) -> np.ndarray:
         buffer, relighter = part.buffer, self._base if part.before else self._relighter

@@ -104,6 +104,7 @@ class Studio:
         seed: root of all random numbers.
         variant: of Mitsuba.
         threads: of Dr.Jit; None: as it is.
+        about: the scene, as of :class:`tron.view.stage.Stage`.
     """
 
     def __init__(
@@ -120,10 +121,11 @@ class Studio:
         seed: int = 0,
         variant: str = "llvm_ad_rgb",
         threads: int | None = None,
+        about: Mapping[str, Any] | None = None,
     ) -> None:
         if not lights:
             raise TronError("there is no light", mend="give one at least")
-        self._make = lambda: Stage(scene, lights, home, seed, self._watch, busy)
+        self._make = lambda: Stage(scene, lights, home, seed, self._watch, busy, about)
         self._machine = variant, threads
         self._show, self._notice, self._finish, self._busy = show, notice, finish, busy
         self._changed = threading.Condition()

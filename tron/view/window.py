@@ -53,6 +53,7 @@ ABOVE = 4.0
 """Spacings above a point that was clicked from which what is inserted is lowered."""
 EVERYWHERE = "0.0.0.0"
 """Host that stands for all addresses of the machine."""
+GUESSED = "*Materials are guessed from the scan's colours, which keep the light of its capture.*"
 BRAND = (232, 150, 60)
 
 
@@ -140,7 +141,8 @@ class Window:
         self._server.request_share_url = lambda *_, **__: None
         subject = find_subject(scene.upright())
         self._frame(home, subject.centre)
-        self._build(subject.radius, light or next(iter(lights)), file, folder, scene.offset)
+        first = light or next(iter(lights))
+        self._build(subject.radius, first, file, folder, scene.offset, scene.materials_guessed)
         self._closed = False
         self.studio = Studio(
             scene, {**lights, **(turned or {})}, home, self._show, self._say,
@@ -174,9 +176,13 @@ class Window:
         server.initial_camera.look_at = tuple(centre)
         server.initial_camera.fov = 2 * float(np.arctan(0.5 * home.height / home.fy))
 
-    def _build(self, size: float, light: str, file: Path, folder: Path, offset: np.ndarray) -> None:
+    def _build(
+        self, size: float, light: str, file: Path, folder: Path, offset: np.ndarray, guessed: bool
+    ) -> None:
         gui = self._server.gui
         gui.add_html(folded_on_phones(), order=-3)
+        if guessed:
+            gui.add_markdown(GUESSED, order=-2)
         self._buffer = gui.add_dropdown("Show", BUFFERS, initial_value="lit", hint="what the picture is of")
         self._buffer.on_update(lambda _: self._want(buffer=self._buffer.value))
         self._quality = gui.add_dropdown(

@@ -9,7 +9,6 @@ import pytest
 
 from examples.stage import BALL, FLOOR, RING, make_scene
 from tron.apps.edit import cli
-from tron.apps.scene_file import load_scene
 from tron.cameras import Camera
 from tron.editing import EditList, Remove, Selection, Views
 from tron.gaussians.edit import subset
@@ -17,6 +16,7 @@ from tron.gaussians.ply import header_comments, write_ply
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
 from tron.relighting.proxy import fingerprint
+from tron.scans import Scan
 
 TOP = Camera.look_at((0.1, -0.45, 4), (0.1, -0.4, 0), fov_deg=50, width=64, height=64)
 
@@ -140,7 +140,7 @@ def test_what_was_guessed_is_said_once(folder, caplog):
     assert edit(folder, "- {action: remove, select: {object: 3}}") == 0
     assert caplog.text.count("does not say which way is up") == 1
     caplog.clear()
-    assert load_scene(folder / "out.ply", None, "as_is").up.tolist() == scene.up.tolist()
+    assert Scan.open(folder / "out.ply", materials="as_is").loaded.up.tolist() == scene.up.tolist()
     assert caplog.text == ""
 
 
@@ -148,7 +148,7 @@ def test_an_up_that_was_given_is_known_of_all_that_is_written(folder):
     scene = GaussianScene.load(folder / "scene.ply")
     scene.up_guessed = True
     scene.save(folder / "scene.ply")
-    load_scene(folder / "scene.ply", (0, 2, 0)).save(folder / "again.ply")
+    Scan.open(folder / "scene.ply", up=(0, 2, 0)).loaded.save(folder / "again.ply")
     assert commented(folder / "again.ply")[0] == "tron up 0.0 1.0 0.0"
 
 
@@ -198,5 +198,5 @@ def test_guessed_materials_are_not_edited_in_silence(folder, caplog):
     scene = GaussianScene.load(folder / "scene.ply")
     scene.materials_guessed = True
     scene.save(folder / "scene.ply")
-    assert edit(folder, "- {action: material, select: {object: 2}, hue: 9}") == 0
-    assert "materials=as_is" in caplog.text
+    assert edit(folder, "- {action: material, select: {object: 2}, hue: 9}", "materials=as_is") == 0
+    assert "give it materials=as_is too" in caplog.text

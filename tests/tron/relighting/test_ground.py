@@ -7,7 +7,7 @@ from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.gaussians.scene import GaussianScene
 from tron.relighting import Relighter
-from tron.relighting.ground import Ground, stands_free
+from tron.relighting.ground import Footing, Ground
 from tron.shading.environments.environment import EnvironmentMap
 
 RADIUS, HEIGHT = 0.5, 1.0
@@ -67,15 +67,14 @@ def test_a_thing_stands_free_unless_it_has_a_floor_or_is_around_the_camera(ball,
         Camera.look_at(place, (0, 0.1, 0), fov_deg=40, width=8, height=8)
         for place in ((0, -4, 1), (0.1, 0, 0), (0, -4, -3))
     )
-    assert stands_free(ball, [outside])
-    assert not stands_free(ball, [outside, inside])
-    assert not stands_free(ball, [below])
+    assert Footing.of(ball).free([outside])
+    assert not Footing.of(ball).free([outside, inside])
+    assert not Footing.of(ball).free([below])
     floor = dense_surfels.plane(0.06, 1.5)
-    assert not stands_free(
-        dense_surfels.scene(dense_surfels.sphere(0.06, 0.5, 0.5), floor, spacing=0.06), [outside]
-    )
+    on_floor = dense_surfels.scene(dense_surfels.sphere(0.06, 0.5, 0.5), floor, spacing=0.06)
+    assert not Footing.of(on_floor).free([outside])
 
 
 def test_the_plane_is_at_the_lowest_opaque_surfels(ball):
-    assert Ground.under(ball, VIEW).height == pytest.approx(-RADIUS, abs=0.02)
-    assert Ground.under(ball, VIEW, height=-2.0).eye == pytest.approx((0, 0, VIEW.position[2]), abs=0.03)
+    assert Footing.of(ball).ground(VIEW).height == pytest.approx(-RADIUS, abs=0.02)
+    assert Footing.of(ball).ground(VIEW, -2.0).eye == pytest.approx((0, 0, VIEW.position[2]), abs=0.03)

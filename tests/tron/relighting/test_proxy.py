@@ -300,7 +300,7 @@ def test_paint_asks_for_no_film_and_no_ray(fog, light, monkeypatch):
         nothing.setattr(relighter, "make_proxy", None)
         nothing.setattr(SurfelTracer, "first_hits", None)
         nothing.setattr(SurfelTracer, "transmittances", None)
-        ours = before.relighter.changed(painted).still_under(before)
+        ours = before.relighter.bring(painted, before.lighting, before=before)
     for name in Guidance.BUFFERS:
         np.testing.assert_array_equal(ours.render(VIEW)[name], fresh[name])
     assert np.abs(fresh.lit - plain.lit)[plain.mask > 0.9].mean() > 0.01

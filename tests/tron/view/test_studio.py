@@ -40,7 +40,7 @@ def random_change(rng: np.random.Generator) -> dict[str, object]:
 
 def baked(stage: Stage) -> np.ndarray:
     """Direct and indirect light at the surfels."""
-    light = stage._right.illumination
+    light = stage._right
     assert light is not None
     assert light.bounced is not None
     return np.concatenate([np.array(light.bounced.direct), np.array(light.bounced.indirect)])

@@ -12,7 +12,6 @@ import numpy as np
 import pytest
 
 from examples.stage import BALL
-from tron.apps.relight.camera_files import read_cameras
 from tron.apps.relight.settings import Settings as Relight
 from tron.cameras import Camera
 from tron.cli.recipes import check, compose_recipe
@@ -20,6 +19,7 @@ from tron.editing import EditList, Material, Separate
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
+from tron.scans.camera_files import read_cameras
 from tron.view.window import Window, require_free_port
 
 PATIENCE = 120

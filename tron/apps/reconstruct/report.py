@@ -17,7 +17,6 @@ import scipy.stats
 
 from tron.apps.reconstruct.pictures import chosen_views, view_pictures
 from tron.apps.reconstruct.settings import ReportSettings
-from tron.apps.relight.camera_files import filmed_orbit, frame_size
 from tron.cameras import Camera
 from tron.captures import Capture
 from tron.cli.progress import track
@@ -30,6 +29,7 @@ from tron.relighting import Relighter
 from tron.relighting.proxy import Proxy
 from tron.report.page import Cell, Film, Films, Picture, Pictures, Table, Tile, format_value
 from tron.report.render import render_template
+from tron.scans.camera_files import filmed_orbit, frame_size
 from tron.seeds import integer
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import write_atomic

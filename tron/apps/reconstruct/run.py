@@ -16,7 +16,6 @@ from tron.apps.reconstruct.pictures import write_light, write_sheet
 from tron.apps.reconstruct.report import write_page
 from tron.apps.reconstruct.settings import Settings
 from tron.apps.reconstruct.splat_capture import is_splats
-from tron.apps.relight.camera_files import write_cameras
 from tron.captures import Capture, View
 from tron.captures.capture import content_hash
 from tron.captures.coverage import seen_from_deg
@@ -27,6 +26,7 @@ from tron.reconstruction import Prior, Reconstruction, reconstruct
 from tron.reconstruction.geometry.training import Stage, StepSummary
 from tron.reconstruction.scores import BACKGROUND, mean_figures, picture, wanted_picture
 from tron.runtime import describe_machine
+from tron.scans.camera_files import write_cameras
 from tron.storage import write_atomic
 from tron.tracing.torch_bridge import render
 

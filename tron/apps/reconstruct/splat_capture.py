@@ -18,15 +18,15 @@ import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
-from tron.apps.relight.camera_files import CAMERAS, filmed_cameras
-from tron.apps.relight.one_view import one_view
-from tron.apps.scene_file import load_scene
-from tron.apps.surroundings import DESCRIPTION, Treatment, treat_surroundings
+from tron.apps.scene_file import SURROUNDINGS
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
 from tron.gaussians.formats.registry import check_header, named_as_splats, refuse_foreign
 from tron.gaussians.scene import GaussianScene
+from tron.scans import Scan
+from tron.scans.camera_files import CAMERAS
+from tron.scans.surroundings import Treatment
 from tron.seeds import generator
 from tron.trajectories import film_around, film_with
 
@@ -67,7 +67,7 @@ class SplatSettings(BaseModel):
         "both: half of each; auto: as in cameras.json beside the file, where photos looked, else around",
     )
     views: int = Field(default=64, ge=4, le=10_000, description="number of pictures")
-    surroundings: Treatment = Field(default="drop", description=DESCRIPTION)
+    surroundings: Treatment = Field(default="drop", description=SURROUNDINGS)
     side: int = Field(default=200, ge=16, le=8192, description="their width and height, pixels")
 
 
@@ -104,28 +104,28 @@ def film_splats(
     """
     refuse_foreign(path)
     check_header(path)
-    scene = load_scene(path, up)
-    surrounded = treat_surroundings(scene, settings.surroundings, path, "splats.surroundings")
-    filmed = filmed_cameras(path, scene.offset) if settings.cameras == "auto" else None
-    if filmed is not None:
-        log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
-    elif settings.cameras == "auto":
-        filmed = one_view(path, surrounded.content, np.eye(3))
+    opened = Scan.open(
+        path, up=up, surroundings=settings.surroundings, key="splats.surroundings", standing=False
+    )
+    content, shown, backdrop = opened.content, opened.shown, opened.backdrop
+    filmed = opened.filmed if settings.cameras == "auto" else None
     if filmed is None:
-        cameras = virtual_cameras(surrounded.content, settings, seed)
+        cameras = virtual_cameras(content, settings, seed)
     else:
         cameras = film_with(filmed, settings.views, settings.side)
+        if path.with_name(CAMERAS).is_file():
+            log.info("%s is filmed from where its photos were taken: %s", path, path.with_name(CAMERAS))
     from tron.reconstruction.film import film  # Mitsuba: not for --help
 
-    kept = keeps_surfels(surrounded.content, settings.geometry, filmed)
-    views = film(surrounded.content, cameras, track)
-    if surrounded.backdrop is not None:
-        views = [_under_its_sky(view, surrounded.shown, surrounded.backdrop) for view in views]
+    kept = keeps_surfels(content, settings.geometry, filmed)
+    views = film(content, cameras, track)
+    if backdrop is not None:
+        views = [_under_its_sky(view, shown, backdrop) for view in views]
     test = frozenset(view.name for view in views[::test_every]) if test_every else frozenset()
     agreed = iter(_agreeing([view for view in views if view.name not in test], fusion))
     views = [replace(view, depth=None) if view.name in test else next(agreed) for view in views]
-    scan = surrounded.content if kept else None
-    return Capture(tuple(views), test, up=scene.up, offset=scene.offset, scan=scan)
+    scan = content if kept else None
+    return Capture(tuple(views), test, up=content.up, offset=content.offset, scan=scan)
 
 
 def keeps_surfels(scene: GaussianScene, geometry: str, cameras: Sequence[Camera] | None) -> bool:

@@ -16,7 +16,6 @@ import numpy as np
 
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.relight.settings import ProxyChoice
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
@@ -24,19 +23,15 @@ from tron.color import LOOKS, from_agx
 from tron.editing.motion import LightNow
 from tron.editing.moving import MovingScene
 from tron.errors import TronError
-from tron.estimation import Estimation
 from tron.flow import surface_motion
-from tron.gaussians.scene import GaussianScene
 from tron.io.images import write_image
 from tron.neural.clips import Overlap, averaged_frames
 from tron.shards.schema import GUIDANCE, displayed, surface_members
 from tron.storage import write_atomic
 
 if TYPE_CHECKING:
-    from tron.models.parts import Part
     from tron.neural.protocols import Renderer
     from tron.relighting import Illumination, Relighter
-    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
     from tron.shading.guidance import Guidance
     from tron.shading.lighting import Lighting
@@ -81,17 +76,16 @@ class Clip:
     lights: Sequence[LightNow] | None = None
     others: Mapping[Path, EnvironmentMap] = field(default_factory=dict)
     _prepared: tuple[tuple[Any, ...], Lighting] | None = None
-    _baked: tuple[float, Lighting, Illumination] | None = None
+    _baked: Illumination | None = None
 
-    def light(self, relighter: Relighter, index: int) -> Illumination:
-        """The environment as frame ``index`` has it, baked where it, or the scene, is another than before."""
-        rotation, lighting = self.rotations[index], self._lighting(index)
-        before = self._baked
-        if before is None or before[:2] != (rotation, lighting) or before[2].relighter is not relighter:
-            with working("light that bounces, baked") if before is None else nullcontext():
-                self._baked = rotation, lighting, relighter.under(lighting.turned_to(rotation))
-        assert self._baked is not None
-        return self._baked[2]
+    def light(self, relighter: Relighter, index: int, now: Mapping[str, Any]) -> Illumination:
+        """The environment as frame ``index`` has it, over what :meth:`Relighter.bring` is given ``now``."""
+        lighting = self._lighting(index)
+        with working("light that bounces, baked") if self._baked is None else nullcontext():
+            self._baked = relighter.bring(
+                light=lighting, rotation=self.rotations[index], before=self._baked, **now
+            )
+        return self._baked
 
     def _lighting(self, index: int) -> Lighting:
         """The environment of frame ``index``, not turned, prepared where it is another than before."""
@@ -202,59 +196,38 @@ class Clip:
 
 
 def trace(
-    scene: GaussianScene,
+    relighter: Relighter,
     cameras: Sequence[Camera],
     clips: Sequence[Clip],
-    *,
-    estimation: Estimation,
     seed: int,
-    backdrop: np.ndarray | None = None,
-    proxy: ProxyChoice = "auto",
-    filmed: Sequence[Camera] | None = None,
-    proxy_file: Path | None = None,
-    ground: Ground | None = None,
     moving: MovingScene | None = None,
     times: Sequence[float] = (),
-    meshes: Sequence[Sequence[Part]] = (),
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
     Args:
-        scene: the surfels.
+        relighter: the scene.
         cameras: one a frame.
         clips: one a light.
-        estimation: of the light.
-        seed: root of its random numbers; a frame's do not depend on the environment.
-        backdrop: (M,) bool, surfels that are in no light's way (:class:`tron.relighting.Relighter`).
-        proxy, filmed, proxy_file: whether light sees a proxy, cameras to film it, and where it is kept, as
-            there.
-        ground: what the scene stands on, as there.
+        seed: root of the random numbers; a frame's do not depend on the environment.
         moving: the scene's motion, if it has one, and the seconds of each frame.
-        meshes: models beside the surfels, as there.
     """
-    from tron.relighting import Relighter
-
-    bounces, rays = seeds.integer(seed, "relight", "bounces"), partial(track, label="where light bounces")
-    with working("surfels of the models") if meshes else nullcontext():
-        relighter = Relighter(
-            scene, estimation, bounces, backdrop=backdrop, track=rays,
-            proxy=proxy, cameras=filmed, proxy_file=proxy_file,
-            filming=partial(track, label="filming a proxy for light"), ground=ground, meshes=meshes,
-        )  # fmt: skip
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
             log.info("frames that have no %s yet are traced again", ", ".join(lacking))
     if not all(clip.folder.finished(index) for clip in clips for index in range(len(cameras))):
         relighter.prepare()
-    follow = None if moving is None else _Follow(relighter, moving)
+    scenes = _Scenes(relighter, moving)
     for index, camera in enumerate(track(cameras, "guidance")):
-        if follow and not all(clip.folder.finished(index) and clip.metered for clip in clips):
-            relighter = follow.to(times[index])
-        surfaces = cache(partial(relighter.surface_maps, camera, estimation))  # alike under all lights
+        surfaces = None  # alike under all lights
         for clip in clips:
             if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
-                light, ray_seed = clip.light(relighter, index), seeds.integer(seed, "relight", index)
+                ray_seed = seeds.integer(seed, "relight", index)
+                light = scenes.under(clip, index, times[index] if times else 0.0)
+                surfaces = surfaces or cache(
+                    partial(light.relighter.surface_maps, camera, relighter.estimation)
+                )
                 frame, buffers = _shade(light, camera, ray_seed, clip, surfaces)
                 clip.seconds.append(time.perf_counter() - started)
                 if not clip.metered:
@@ -264,25 +237,26 @@ def trace(
             clip.write_pictures(index)
 
 
-class _Follow:
-    """The relighter of a scene that moves; from one time to another it shares what has not moved."""
+class _Scenes:
+    """The scene of each frame, under the lights of its clips; ``moving`` if it does."""
 
-    def __init__(self, first: Relighter, moving: MovingScene) -> None:
+    def __init__(self, first: Relighter, moving: MovingScene | None) -> None:
         self._first, self._moving, self._last, self._poses = first, moving, first, b""
+        self._now: dict[str, Any] = {"scene": first.scene}
 
-    def to(self, seconds: float) -> Relighter:
-        poses = self._moving.poses_at(seconds)
-        if poses != self._poses:
-            scene, proxy = self._moving.at(seconds), self._first.proxy
+    def under(self, clip: Clip, index: int, seconds: float) -> Illumination:
+        if self._moving is not None and (poses := self._moving.poses_at(seconds)) != self._poses:
+            scene, proxy, meshes = self._moving.at(seconds), self._first.proxy, self._first.meshes
             if proxy is not None:
                 proxy = replace(proxy, surfels=self._moving.follow(proxy.surfels, seconds))
-            meshes = self._first.meshes
             if self._moving.meshes and meshes is not None:
                 meshes = meshes.moved(self._moving.meshes_at(seconds, len(meshes)))
-            stands = scene is self._moving.scene and not self._moving.meshes
-            self._last = self._first if stands else self._last.changed(scene, proxy=proxy, meshes=meshes)
-            self._poses = poses
-        return self._last
+            self._poses, self._now = poses, {"scene": scene, "proxy": proxy, "meshes": meshes}
+            if scene is self._moving.scene and not self._moving.meshes:
+                self._last, self._now = self._first, {"scene": self._first.scene}
+        light = clip.light(self._last, index, self._now)
+        self._last = light.relighter
+        return light
 
 
 def _shade(

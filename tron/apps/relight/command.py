@@ -12,28 +12,17 @@ import logging
 import math
 import time
 from collections.abc import Sequence
+from contextlib import nullcontext
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 import tron
-from tron.apps.capture_light import LIGHT, is_of_capture, over_scene
 from tron.apps.frame_folder import FrameFolder
-from tron.apps.relight.camera_files import (
-    CAMERAS,
-    filmed_orbit,
-    filmed_with,
-    in_frame_of,
-    read_cameras,
-    stated,
-)
 from tron.apps.relight.clip import DEPTH, Clip, trace
-from tron.apps.relight.scan_materials import proxy_file, with_materials
 from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture
-from tron.apps.scene_file import load_scene
-from tron.apps.surroundings import treat_surroundings
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.installation import require_extra
@@ -44,9 +33,7 @@ from tron.editing.models import PlacedModel, foot_of, read_model
 from tron.editing.motion import Motion
 from tron.editing.moving import in_motion
 from tron.errors import TronError, located
-from tron.framing import upright
 from tron.gaussians.formats.registry import check_header, refuse_foreign
-from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.io.cameras.registry import UPRIGHT
 from tron.io.recognised import refuse_by_sight
@@ -54,13 +41,15 @@ from tron.neural.clips import check_frames
 from tron.neural.network_gains import Way, best_first, quality_of
 from tron.neural.shipped import DEFAULT, SHIPPED, checkpoint_file
 from tron.runtime import activate, describe_machine, set_torch_threads, torch_device
+from tron.scans import Scan
+from tron.scans.camera_files import CAMERAS, filmed_orbit, in_frame_of, read_cameras, stated
+from tron.scans.scan import LIGHT, is_of_capture
 from tron.shards.schema import GUIDANCE
 from tron.storage import locked, require_free_space, sha256, write_atomic
 from tron.trajectories import keyframed, plan_cameras, turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
-    from tron.relighting.ground import Ground
     from tron.shading.environments.environment import EnvironmentMap
 
 
@@ -103,39 +92,35 @@ def main(settings: Settings) -> None:
         settings, renderer = chosen_network(settings)
         lights = settings.by_light()
     with working("reading the scene"):
-        scene = load_scene(settings.scene, settings.up, settings.materials, settings.projection)
-    offset = scene.offset
+        scan = Scan.open(
+            settings.scene, up=settings.up, projection=settings.projection, materials=settings.materials,
+            surroundings=settings.surroundings, seed=settings.seed, apart=settings.output_dir, track=track,
+        )  # fmt: skip
+    offset, turn = scan.offset, scan.turn
     if given is not None and settings.cameras is not None:
         given = in_frame_of(offset, given, settings.cameras)
-    turn = upright(scene.up)  # to +z, which is up in environment maps
-    environments = [
-        over_scene(each, light.light, settings.scene, turn) for light, each in zip(lights, environments)
-    ]
-    others = {path: over_scene(each, path, settings.scene, turn) for path, each in others.items()}
-    scene = scene if np.allclose(turn, np.eye(3)) else scene.rotated(turn)
+    environments = [scan.over(each, light.light) for light, each in zip(lights, environments)]
+    others = {path: scan.over(each, path) for path, each in others.items()}
     with working("looking for surroundings"):
-        surrounded = treat_surroundings(scene, settings.surroundings, settings.scene)
-    scene = surrounded.shown
-    filmed = filmed_with(settings.scene, turn, offset, surrounded.content)
-    kept = KeptFiles(settings.scene, settings.output_dir)
-    if scene.materials_guessed and settings.materials == "auto":
-        scene = with_materials(scene, kept, filmed, settings.seed, surrounded.backdrop, turn)
+        content = scan.content
     if given is not None:
         upright_file = settings.cameras is not None and settings.cameras.suffix.lower() in UPRIGHT
         cameras = given if upright_file else turn_cameras(given, turn)
     else:
-        cameras = _planned(settings, surrounded.content, filmed)
+        cameras = _planned(settings, content, scan.filmed)
     # Without a network the relit picture is one of them, and is shown as such; so is lit if nothing bounces.
     guidance = [name for name in GUIDANCE if name != settings.source and (settings.bounces or name != "lit")]
     guidance = guidance if renderer is None else renderer.config.guidance
     averaged = averaged_frames_of(settings, len(cameras))
     network = describe_network(settings, renderer, len(cameras))
     clips = [_clip(*each, len(cameras), guidance, averaged > 1) for each in zip(lights, environments)]
-    ground = _ground(settings, surrounded.content, cameras, float(turn[2] @ offset))
+    ground = scan.ground(cameras, settings.ground)
+    if ground is not None:
+        height = ground.height + float(turn[2] @ offset)
+        log.info("it stands on a ground at height %.4g; ground=none takes it away", height)
     placing = track(settings.meshes, "placing the models") if settings.meshes else ()
     meshes = [
-        each.stood(parts, surrounded.content, turn, ground and ground.height)
-        for each, parts in zip(placing, models)
+        each.stood(parts, content, turn, ground and ground.height) for each, parts in zip(placing, models)
     ]
     times, moving = [index / settings.fps for index in range(len(cameras))], None
     if motion is not None:
@@ -147,8 +132,8 @@ def main(settings: Settings) -> None:
                 motion.end, times[-1], math.ceil(motion.end * settings.fps) + 1,
             )  # fmt: skip
         with working("what moves"):
-            height, feet = ground and ground.height, [foot_of(parts, scene.up) for parts in meshes]
-            moving = in_motion(motion, scene, times[-1], turn, height, surrounded.backdrop, feet)
+            height, feet = ground and ground.height, [foot_of(parts, content.up) for parts in meshes]
+            moving = in_motion(motion, scan.scene, times[-1], turn, height, scan.backdrop, feet)
         for clip in clips:
             clip.lights, clip.others = [motion.light_at(time) for time in times], others
             clip.exposure = clip.first_exposure()
@@ -161,15 +146,9 @@ def main(settings: Settings) -> None:
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
             clip.folder.claim(_made_with(light, cameras, turn), settings.overwrite, model_defaults(Settings))
-        traced = {"estimation": settings.estimation(), "seed": settings.seed, "proxy": settings.proxy}
-        traced["filmed"] = filmed
-        if settings.proxy == "never":
-            log.info("proxy=never: light sees the scan itself")
-        else:
-            traced["proxy_file"] = proxy_file(scene, kept, filmed, surrounded.backdrop)
-        traced["ground"] = ground
-        traced |= {"moving": moving, "times": times, "meshes": meshes}
-        trace(scene, cameras, clips, **traced, backdrop=surrounded.backdrop)
+        with working("surfels of the models") if meshes else nullcontext():
+            lit = scan.relighter(settings.estimation(), ground=ground, proxy=settings.proxy, meshes=meshes)
+        trace(lit, cameras, clips, settings.seed, moving, times)
         clock.lap("guidance")
         if renderer is not None:
             for clip in clips:
@@ -181,7 +160,7 @@ def main(settings: Settings) -> None:
                 clip.assemble(light.output_dir, settings.fps)
         clock.lap("videos")
         for light, clip in zip(lights, clips):
-            report = _report(light, clip, scene, turn_cameras(cameras, turn.T), clock)
+            report = _report(light, clip, scan.scene, turn_cameras(cameras, turn.T), clock)
             report["network"] = network
             report |= stated(offset)
             write_atomic(light.output_dir / "relight.json", json.dumps(report, indent=1) + "\n")
@@ -196,20 +175,6 @@ def _motion(path: Path) -> Motion:
         if not environment.is_file():
             raise TronError("file not found", environment, f"{path} names it")
     return motion
-
-
-def _ground(
-    settings: Settings, scene: GaussianScene, cameras: Sequence[Camera], offset: float
-) -> Ground | None:
-    """What the scene, z up, stands on; ``offset`` is the height that was taken away from its file's."""
-    from tron.relighting.ground import Ground, stands_free
-
-    if settings.ground == "none" or (settings.ground == "auto" and not stands_free(scene, cameras)):
-        return None
-    given = settings.ground if isinstance(settings.ground, float) else None
-    ground = Ground.under(scene, cameras[0], None if given is None else given - offset)
-    log.info("it stands on a ground at height %.4g; ground=none takes it away", ground.height + offset)
-    return ground
 
 
 def _planned(settings: Settings, scene: GaussianScene, filmed: list[Camera] | None) -> list[Camera]:

@@ -7,12 +7,9 @@ from typing import TYPE_CHECKING, Annotated, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
-from tron.apps.capture_light import LIGHT
-from tron.apps.relight.camera_files import CAMERAS, frame_size
 from tron.apps.relit import Background
-from tron.apps.scene_file import SeenAs, Up
+from tron.apps.scene_file import GROUND, SURROUNDINGS, FoundMaterials, SeenAs, Up
 from tron.apps.splat_file import SceneFile
-from tron.apps.surroundings import DESCRIPTION, Treatment
 from tron.color import Look
 from tron.editing.models import PlacedModel
 from tron.errors import TronError
@@ -22,6 +19,9 @@ from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
 from tron.runtime import Variant
+from tron.scans.camera_files import CAMERAS, frame_size
+from tron.scans.scan import LIGHT, GroundChoice
+from tron.scans.surroundings import Treatment
 from tron.shards.schema import guidance_members, light_members
 from tron.trajectories import TrajectoryName
 
@@ -61,12 +61,8 @@ class Settings(BaseModel):
         "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
         examples=["[1,1,1]"],
     )
-    ground: Literal["auto", "none"] | float = Field(
-        "auto",
-        description="level plane that shows the environment's ground and shadows of what stands there; auto: "
-        "below a thing that has no floor of its own; or its height along up, in the scene's units",
-    )
-    surroundings: Treatment = Field("drop", description=DESCRIPTION)
+    ground: GroundChoice = Field("auto", description=GROUND)
+    surroundings: Treatment = Field("drop", description=SURROUNDINGS)
     proxy: ProxyChoice = Field(
         "auto",
         description="what light sees of a scan whose splats lie in many layers: one layer of surfels, made "
@@ -75,12 +71,7 @@ class Settings(BaseModel):
         "itself",
     )
     projection: SeenAs = "auto"
-    materials: Literal["auto", "as_is"] = Field(
-        "auto",
-        description="of a scan without any; auto: found once with the light it was captured in, which is "
-        "taken out of its colours, and kept as NAME.materials.ply where its proxy is; as_is: guessed from "
-        "its colours",
-    )
+    materials: FoundMaterials = "auto"
     rotation: float | tuple[float, float] = Field(
         0.0,
         description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "

@@ -5,9 +5,9 @@ import json
 import numpy as np
 import pytest
 
-from tron.apps.relight.camera_files import read_cameras
 from tron.cameras import Camera
 from tron.errors import TronError
+from tron.scans.camera_files import read_cameras
 from tron.trajectories import plan_cameras
 
 VIEW = {"width": 64, "height": 48, "fov_deg": 50}

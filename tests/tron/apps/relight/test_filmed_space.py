@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tron.apps.relight.camera_files import CAMERAS, filmed_cameras, filmed_orbit, read_cameras, write_cameras
 from tron.apps.relight.settings import Settings
 from tron.cameras import Camera, focus_of
 from tron.captures import View
 from tron.errors import TronError
+from tron.scans.camera_files import CAMERAS, filmed_cameras, filmed_orbit, read_cameras, write_cameras
 
 FRAMES = 40
 IMAGE = {"width": 64, "height": 48, "fov_deg": 40.0}

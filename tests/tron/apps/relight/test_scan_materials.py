@@ -1,4 +1,4 @@
-"""Materials of a plain scan for tron-relight: found once, kept beside it, and used for what they are of."""
+"""Materials of a plain scan: found once, kept beside it, and used for what they are of."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -7,12 +7,12 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from tron.apps.relight import scan_materials
-from tron.apps.relight.scan_materials import proxy_file, with_known_materials, with_materials
-from tron.framing import upright
 from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
-from tron.relighting.proxy import Proxy
+from tron.relighting.proxy import Proxy, fingerprint
+from tron.scans import Scan
+from tron.scans import materials as scan_materials
+from tron.scans.materials import with_materials
 
 CARRY = "tron.reconstruction.materials.carried.carry_materials"
 
@@ -107,7 +107,10 @@ def test_a_folder_that_takes_no_files_has_them_in_the_output(asked, plain, tmp_p
     for _ in range(2):
         kept = KeptFiles(path, out)
         scene = with_materials(plain, kept, None, 0)
-        assert Relighter(scene, proxy="always", proxy_file=proxy_file(scene, kept, None)).proxy is not None
+        assert (
+            Relighter(scene, proxy="always", proxy_file=kept.path("proxy", fingerprint(scene, None))).proxy
+            is not None
+        )
     assert asked == [4]
     assert sorted(file.name for file in out.iterdir()) == ["scan.materials.ply", "scan.proxy.ply"]
     assert sum("cannot be written" in line for line in caplog.messages) == 1
@@ -150,14 +153,24 @@ def test_without_the_libraries_of_the_fit_the_scan_is_as_it_is(plain, tmp_path, 
     assert "needs torch: pip install 'tron-relight[reconstruct]'" in caplog.text
 
 
-def test_materials_that_are_known_are_those_of_the_scan_in_its_file(asked, plain, tmp_path):
-    scan = plain.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]]))
-    kept = KeptFiles(tmp_path / "scan.ply", tmp_path)
-    assert with_known_materials(scan, kept) is scan
-    with_materials(scan.upright(), kept, None, 0, None, upright(scan.up))
-    found = with_known_materials(scan, kept)
-    np.testing.assert_array_equal(found.base_color[:, 1], np.float32(0.6))
-    np.testing.assert_array_equal(found.means, scan.means)
-    assert not found.materials_guessed
-    other = replace(scan, means=scan.means + np.float32(0.1))
-    assert with_known_materials(other, kept) is other
+def test_materials_are_those_of_the_scan_in_its_file(asked, plain, tmp_path):
+    plain.rotated(np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])).save(tmp_path / "scan.ply")
+    scan = Scan.open(tmp_path / "scan.ply")
+    assert asked == []
+    for found in (scan.in_file, Scan.open(tmp_path / "scan.ply").in_file):
+        np.testing.assert_array_equal(found.base_color[:, 1], np.float32(0.6))
+        np.testing.assert_array_equal(found.means, scan.loaded.means)
+        assert not found.materials_guessed
+    assert asked == [4]
+    assert Scan.open(tmp_path / "scan.ply", materials="as_is").in_file.materials_guessed
+
+
+@pytest.mark.parametrize("treatment", ["drop", "background"])
+def test_what_surrounds_a_scan_keeps_its_own_in_the_file(asked, plain, tmp_path, monkeypatch, treatment):
+    plain.save(tmp_path / "scan.ply")
+    around = np.arange(len(plain)) % 7 == 0
+    monkeypatch.setattr("tron.tracing.surroundings.find_surroundings", lambda scene: around)
+    scan = Scan.open(tmp_path / "scan.ply", surroundings=treatment)
+    np.testing.assert_array_equal(scan.in_file.base_color[~around, 1], np.float32(0.6))
+    np.testing.assert_array_equal(scan.in_file.base_color[around], scan.loaded.base_color[around])
+    assert len(scan.scene) == (len(plain) if treatment == "background" else (~around).sum())

@@ -15,11 +15,11 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
-from tron.apps.relight.one_view import one_view
 from tron.cameras import Camera, focus_of
 from tron.errors import TronError
 from tron.io.cameras.registry import UPRIGHT, cameras_of
 from tron.io.local_frame import ORIGIN, moved_cameras
+from tron.scans.one_view import one_view
 from tron.storage import write_atomic
 from tron.trajectories import keyframed, turn_cameras
 

@@ -15,11 +15,6 @@ from tron.gaussians.scene import GaussianScene
 log = logging.getLogger(__name__)
 
 Treatment = Literal["drop", "background", "keep"]
-DESCRIPTION = (
-    "splats far around the scene that shut out the light, such as a shell of sky: drop leaves them out; "
-    "background shows them behind the scene, lit, but frames nothing by them and has no shadow nor bounce of "
-    "theirs; keep treats them as all others. Walls of rooms and distant hills are none"
-)
 _SAYS = {
     "drop": "they are left out; %(key)s=background shows them behind the scene, %(key)s=keep keeps them in "
     "the light's way",
@@ -35,17 +30,19 @@ class Surrounded:
         shown: the surfels that cameras see.
         content: those of them that are framed and meet light.
         backdrop: (M,) bool, those of ``shown`` that are not in ``content``; None where all are.
+        around: (N,) bool, those of the scene that are not in ``content``; None where all are.
     """
 
     shown: GaussianScene
     content: GaussianScene
     backdrop: np.ndarray | None = None
+    around: np.ndarray | None = None
 
 
 def treat_surroundings(
     scene: GaussianScene, treatment: Treatment, where: Path, key: str = "surroundings"
 ) -> Surrounded:
-    """Find what surrounds a scene, say so in a line that names ``key``, and treat it.
+    """Find what surrounds a scene, say so in a line that names ``key``, unless that is empty, and treat it.
 
     The Mitsuba variant must be set.
     """
@@ -56,13 +53,14 @@ def treat_surroundings(
     around = find_surroundings(scene)
     if not around.any():
         return Surrounded(scene, scene)
-    log.warning(
-        "%s: %d of %d splats surround the scene from afar and shut out the light, as a sky does: %s",
-        where, int(around.sum()), len(scene), _SAYS[treatment] % {"key": key},
-    )  # fmt: skip
+    if key:
+        log.warning(
+            "%s: %d of %d splats surround the scene from afar and shut out the light, as a sky does: %s",
+            where, int(around.sum()), len(scene), _SAYS[treatment] % {"key": key},
+        )  # fmt: skip
     content = subset(scene, ~around)
     if treatment == "drop":
-        return Surrounded(content, content)
+        return Surrounded(content, content, around=around)
     shown = scene.turned_over(around & scene.looks_away(np.median(content.means, axis=0)))
     shown.spacing = content.spacing
-    return Surrounded(shown, content, around)
+    return Surrounded(shown, content, around, around)

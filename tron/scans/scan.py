@@ -1,0 +1,306 @@
+"""A file of splats made ready to be lit, as tron-relight, tron-bake, tron-view and tron-edit have it.
+
+    scan = Scan.open("scan.ply")
+    frame = scan.under("studio.hdr").render(camera)   # the first frame of tron-relight from there
+
+What is cheap is done when the scan is opened: it is read, and what is up is settled. All else is done when it
+is first asked for: what surrounds it is found, its materials are found, once, and kept beside it, and so is
+its proxy for light. Cameras, grounds and lights are of the world that is upright, +z up; :attr:`Scan.turn`
+takes the file's there.
+"""
+
+from __future__ import annotations
+
+import logging
+from collections.abc import Callable, Sequence
+from functools import cached_property
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, Literal
+
+import numpy as np
+
+from tron.cameras import Camera
+from tron.estimation import PREVIEW, Estimation
+from tron.framing import upright
+from tron.gaussians.edit import subset
+from tron.gaussians.kept import KeptFiles
+from tron.gaussians.scene import GaussianScene
+from tron.runtime import activate
+from tron.scans.camera_files import filmed_with
+from tron.scans.materials import put_on, with_materials
+from tron.scans.surroundings import Surrounded, Treatment, treat_surroundings
+from tron.seeds import integer
+
+if TYPE_CHECKING:
+    from tron.models.parts import Part
+    from tron.reconstruction.progress import Track
+    from tron.relighting import EnvironmentMap, Illumination, Relighter
+    from tron.relighting.ground import Footing, Ground, GroundOf
+
+log = logging.getLogger(__name__)
+
+LIGHT = "environment.exr"
+"""The light of a capture: a map beside its scene, in the world of the file, as tron-reconstruct writes it."""
+APART = Path("outputs")
+"""Where what is made of a scan is kept if its own folder cannot be written."""
+GroundChoice = Literal["auto", "none"] | float
+Materials = Literal["auto", "as_is"]
+
+
+class Scan:
+    """A file of splats; made by :meth:`open`.
+
+    Attributes:
+        file: that it was read from.
+        loaded: all of its splats, in its frame. Its up is settled; its materials may be guessed.
+        seed: root of all random numbers.
+    """
+
+    def __init__(
+        self, file: Path, loaded: GaussianScene, seed: int, treatment: Treatment, materials: Materials,
+        apart: Path, track: Track, key: str, standing: bool,
+    ) -> None:  # fmt: skip
+        self.file, self.loaded, self.seed, self._track = file, loaded, seed, track
+        self._treatment: Treatment = treatment
+        self._materials, self._key, self._standing = materials, key, standing
+        self.kept = KeptFiles(file, apart)  # where what is made of it once lies
+
+    @classmethod
+    def open(
+        cls,
+        file: str | Path,
+        *,
+        up: Sequence[float] | None = None,
+        projection: Literal["auto", "disks"] = "auto",
+        surroundings: Treatment = "drop",
+        materials: Materials = "auto",
+        seed: int = 0,
+        apart: Path = APART,
+        track: Track = lambda items, _: items,
+        key: str = "surroundings",
+        standing: bool = True,
+    ) -> Scan:
+        """Read a scan, with a line in the log where its materials or which way is up are guessed.
+
+        What is up is settled by that: files that are made of the scan say so, and nobody is warned again.
+
+        Args:
+            file: a PLY of TRON, 3DGS or 2DGS, or another file of splats.
+            up: direction of any length, in the file's frame; None: the file's own.
+            projection: of its splats: the file's (auto), or disks in space.
+            surroundings: what is done with a sky around it.
+            materials: those that are guessed are looked for (auto), or stay.
+            seed: root of all random numbers.
+            apart: folder of what is made of it once, where its own cannot be written.
+            track: wraps long loops, ``track(items, label)``.
+            key: the setting that a line about surroundings names; empty: no line.
+            standing: whether it is turned upright; else the upright world is the file's own frame.
+
+        Raises:
+            TronError: the file holds no splats or is damaged.
+        """
+        file = Path(file)
+        scene = GaussianScene.load(file)
+        if projection != "auto":
+            scene.projection = projection
+        if scene.materials_guessed and materials == "as_is":
+            log.warning(
+                "%s has no materials%s: they are guessed from its colours, which keep the light that it was "
+                "captured in", file, "" if scene.oriented else " and normals without a sign",
+            )  # fmt: skip
+        if up is not None:
+            scene.up = np.array(up) / np.linalg.norm(up)
+        elif scene.up_guessed:
+            log.warning(
+                "%s does not say which way is up: -y is taken, as in most 3DGS files; if the picture lies on "
+                "its side, give up=[0,0,1] or another direction", file,
+            )  # fmt: skip
+        scene.up_guessed = False
+        return cls(file, scene, seed, surroundings, materials, apart, track, key, standing)
+
+    @property
+    def offset(self) -> np.ndarray:
+        """(3,) what was taken away from the file's coordinates: it is added to those of the frame."""
+        return self.loaded.offset
+
+    @cached_property
+    def turn(self) -> np.ndarray:
+        """(3, 3) rotation from the file's frame to the upright world, where +z is up as in environments."""
+        return upright(self.loaded.up) if self._standing else np.eye(3)
+
+    @cached_property
+    def _surrounded(self) -> Surrounded:
+        _set_variant()
+        scene = self.loaded.upright() if self._standing else self.loaded
+        return treat_surroundings(scene, self._treatment, self.file, self._key)
+
+    @property
+    def content(self) -> GaussianScene:
+        """What is framed and meets light, upright; its materials may be guessed."""
+        return self._surrounded.content
+
+    @property
+    def shown(self) -> GaussianScene:
+        """What cameras see, upright, with the materials of the file, guessed or not."""
+        return self._surrounded.shown
+
+    @property
+    def backdrop(self) -> np.ndarray | None:
+        """(M,) bool, surfels of :attr:`scene` that are in no light's way; None: none are."""
+        return self._surrounded.backdrop
+
+    @cached_property
+    def filmed(self) -> list[Camera] | None:
+        """Cameras that it was filmed with, upright; None where nothing tells."""
+        return filmed_with(self.file, self.turn, self.offset, self.content)
+
+    @property
+    def _finds_materials(self) -> bool:
+        return self.loaded.materials_guessed and self._materials == "auto"
+
+    @cached_property
+    def scene(self) -> GaussianScene:
+        """What cameras see, upright, with its materials: found in minutes the first time, and kept.
+
+        Where they cannot be found they stay guessed, with a line that says why.
+        """
+        if not self._finds_materials:
+            return self.shown
+        whose = self.shown, self.kept, self.filmed, self.seed
+        return with_materials(*whose, self.backdrop, self.turn, self._track)
+
+    @cached_property
+    def in_file(self) -> GaussianScene:
+        """All splats as the file has them, in its frame, with the materials of :attr:`scene`, to be edited.
+
+        What surrounds the scan has none, and stays as it is.
+        """
+        if not self._finds_materials or self.scene.materials_guessed:
+            return self.loaded
+        around = self._surrounded.around
+        found = self.scene if self.backdrop is None else subset(self.scene, ~self.backdrop)
+        return put_on(self.loaded, found, around)
+
+    def over(self, environment: EnvironmentMap, file: Path) -> EnvironmentMap:
+        """A map of a file as it stands over the upright scan: that of its capture turns with it.
+
+        Any other map has +z up and stays.
+        """
+        if not is_of_capture(file, self.file) or np.allclose(self.turn, np.eye(3), atol=1e-6):
+            return environment
+        log.info("%s is of the scene's world and is turned upright with it", file)
+        return environment.turned(self.turn)
+
+    def ground(self, cameras: Sequence[Camera], choice: GroundChoice = "auto") -> Ground | None:
+        """What the scan stands on, seen from the first of a film's cameras, upright; None: nothing.
+
+        Args:
+            cameras: of the film.
+            choice: where all cameras see a thing without a floor of its own from without (auto), nothing
+                (none), or at a height along up, in the file's units.
+        """
+        if choice == "none" or (choice == "auto" and not self._footing.free(cameras)):
+            return None
+        away = float(self.turn[2] @ self.offset)
+        return self._footing.ground(cameras[0], None if isinstance(choice, str) else choice - away)
+
+    def ground_of(self, choice: GroundChoice = "auto") -> Callable[[Camera], Ground | None]:
+        """What says :meth:`ground` of each camera alone."""
+        return lambda camera: self.ground([camera], choice)
+
+    @cached_property
+    def _footing(self) -> Footing:
+        from tron.relighting.ground import Footing
+
+        return Footing.of(self.content)
+
+    def relighter(
+        self,
+        estimation: Estimation = PREVIEW,
+        *,
+        ground: GroundOf | Literal["auto"] = "auto",
+        proxy: Literal["auto", "always", "never"] = "auto",
+        meshes: Sequence[Sequence[Part]] = (),
+    ) -> Relighter:
+        """The scan as it is lit, with its ground and with its proxy, which is kept beside it.
+
+        Args:
+            estimation: of the light; the default is tron-relight's.
+            ground: of all frames (:meth:`ground`); auto: of each frame its own.
+            proxy, meshes: as of :class:`tron.relighting.Relighter`.
+        """
+        from tron.relighting import Relighter
+
+        if proxy == "never":
+            log.info("proxy=never: light sees the scan itself")
+        relighter = Relighter(
+            self.scene, estimation, self.root, backdrop=self.backdrop, proxy=proxy, cameras=self.filmed,
+            proxy_file=None if proxy == "never" else self.proxy_file, meshes=meshes,
+            ground=self.ground_of() if ground == "auto" else ground,
+            track=lambda rays: self._track(rays, "where light bounces"),
+            filming=lambda views: self._track(views, "filming a proxy for light"),
+        )  # fmt: skip
+        relighter.frame_seed = self.frame_seed(0)
+        return relighter
+
+    def about(self, ground: GroundChoice = "auto") -> dict[str, Any]:
+        """Arguments of a Relighter of :attr:`in_file`, turned upright, and what is made of it by edits.
+
+        Its surroundings, if it has any, are in the light's way: its proxy is none that is kept.
+        """
+        whole = self._surrounded.around is None
+        return {
+            "ground": self.ground_of(ground),
+            "cameras": self.filmed,
+            "proxy_file": self.proxy_file if whole else None,
+        }
+
+    @property
+    def proxy_file(self) -> Path:
+        """The file that has its proxy for light, or is to have it."""
+        from tron.relighting.proxy import fingerprint
+
+        content = self.scene if self.backdrop is None else subset(self.scene, ~self.backdrop)
+        return self.kept.path("proxy", fingerprint(content, self.filmed))
+
+    @property
+    def root(self) -> int:
+        """Root of the random numbers of light that bounces in it."""
+        return integer(self.seed, "relight", "bounces")
+
+    def frame_seed(self, index: int) -> int:
+        """Root of the random numbers of a film's frame."""
+        return integer(self.seed, "relight", index)
+
+    def under(
+        self, light: str | Path | EnvironmentMap, estimation: Estimation = PREVIEW, *, rotation: float = 0.0
+    ) -> Illumination:
+        """The scan under a light, to be rendered from any camera, upright.
+
+        Args:
+            light: an environment, +z up, or its file; that of the scan's capture turns with it.
+            estimation: of the light.
+            rotation: of the environment about up, degrees, counter-clockwise seen from above.
+
+        Raises:
+            TronError: the file holds no light.
+        """
+        _set_variant()
+        from tron.relighting import EnvironmentMap
+        from tron.shading.lighting import Lighting
+
+        if not isinstance(light, EnvironmentMap):
+            light = self.over(EnvironmentMap.load(Path(light)), Path(light))
+        return self.relighter(estimation).under(Lighting(light).turned_to(rotation))
+
+
+def is_of_capture(light: Path, scene: Path) -> bool:
+    """Whether a map is the one beside the scene's file."""
+    return light.resolve() == scene.with_name(LIGHT).resolve()
+
+
+def _set_variant() -> None:
+    import mitsuba as mi
+
+    if mi.variant() is None:
+        activate()
