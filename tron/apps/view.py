@@ -5,11 +5,11 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.scene_file import GROUND, FoundMaterials, SeenAs, Up, check_scene_files
+from tron.apps.scene_file import GROUND, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
@@ -53,7 +53,11 @@ class Settings(BaseModel):
     port: int = Field(8080, ge=1, le=65535, description="port to listen on")
     ground: GroundChoice = Field("auto", description=GROUND)
     projection: SeenAs = "auto"
-    materials: FoundMaterials = "auto"
+    materials: Literal["kept", "auto", "as_is"] = Field(
+        "kept",
+        description="of a scan without any; kept: those that tron-relight or auto has found, else guessed from "
+        "its colours; auto: found first, in minutes, and kept; as_is: guessed",
+    )
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"

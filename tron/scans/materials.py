@@ -36,6 +36,7 @@ def with_materials(
     backdrop: np.ndarray | None = None,
     turn: np.ndarray | None = None,
     track: Track = lambda items, _: items,
+    find: bool = True,
 ) -> GaussianScene:
     """The scan with materials, free of the light it was captured in; as it is where none can be told.
 
@@ -49,6 +50,7 @@ def with_materials(
         backdrop: (M,) bool, surfels that are in no light's way, which stay as they are.
         turn: (3, 3) that the file's scene was turned by; what is kept beside it stands as it does.
         track: wraps long loops.
+        find: them where none are kept, in minutes; else they stay guessed.
     """
     from tron.relighting.proxy import fingerprint  # Mitsuba: not for --help
 
@@ -56,6 +58,12 @@ def with_materials(
     made_from = fingerprint(content, filmed)
     path = kept.found("materials", made_from)
     found = _read(path, len(content))
+    if found is None and not find:
+        log.warning(
+            "%s has no materials: they are guessed from its colours; materials=auto finds them, once, in minutes",
+            kept.scan,
+        )
+        return scene
     if found is None:
         try:
             require_extra("finding a scan's materials", "reconstruct")

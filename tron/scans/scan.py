@@ -44,7 +44,7 @@ LIGHT = "environment.exr"
 APART = Path("outputs")
 """Where what is made of a scan is kept if its own folder cannot be written."""
 GroundChoice = Literal["auto", "none"] | float
-Materials = Literal["auto", "as_is"]
+Materials = Literal["auto", "kept", "as_is"]
 
 
 class Scan:
@@ -89,7 +89,8 @@ class Scan:
             up: direction of any length, in the file's frame; None: the file's own.
             projection: of its splats: the file's (auto), or disks in space.
             surroundings: what is done with a sky around it.
-            materials: those that are guessed are looked for (auto), or stay.
+            materials: those that are guessed are looked for (auto), taken from beside the file where they were
+                found before (kept), or stay (as_is).
             seed: root of all random numbers.
             apart: folder of what is made of it once, where its own cannot be written.
             track: wraps long loops, ``track(items, label)``.
@@ -156,7 +157,7 @@ class Scan:
 
     @property
     def _finds_materials(self) -> bool:
-        return self.loaded.materials_guessed and self._materials == "auto"
+        return self.loaded.materials_guessed and self._materials != "as_is"
 
     @cached_property
     def scene(self) -> GaussianScene:
@@ -167,7 +168,8 @@ class Scan:
         if not self._finds_materials:
             return self.shown
         whose = self.shown, self.kept, self.filmed, self.seed
-        return with_materials(*whose, self.backdrop, self.turn, self._track)
+        find = self._materials == "auto"
+        return with_materials(*whose, self.backdrop, self.turn, self._track, find)
 
     @cached_property
     def in_file(self) -> GaussianScene:

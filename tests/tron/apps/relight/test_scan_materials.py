@@ -174,3 +174,15 @@ def test_what_surrounds_a_scan_keeps_its_own_in_the_file(asked, plain, tmp_path,
     np.testing.assert_array_equal(scan.in_file.base_color[~around, 1], np.float32(0.6))
     np.testing.assert_array_equal(scan.in_file.base_color[around], scan.loaded.base_color[around])
     assert len(scan.scene) == (len(plain) if treatment == "background" else (~around).sum())
+
+
+def test_kept_ones_are_taken_and_none_are_looked_for(asked, plain, tmp_path, caplog):
+    """As tron-view opens a scan: at once."""
+    assert with_materials(plain, beside(tmp_path), None, 0, find=False) is plain
+    assert not asked
+    assert "materials=auto finds them" in caplog.text
+    found = with_materials(plain, beside(tmp_path), None, 0)
+    kept = with_materials(plain, beside(tmp_path), None, 0, find=False)
+    np.testing.assert_array_equal(kept.base_color, found.base_color)
+    assert not kept.materials_guessed
+    assert len(asked) == 1
