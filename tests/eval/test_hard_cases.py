@@ -6,7 +6,21 @@ import numpy as np
 import pytest
 
 from eval.tracing import hard_cases
-from eval.tracing.hard_cases import bars, box, low_sun, metal_box, overcast, sheet, sunny, surfels
+from eval.tracing.hard_cases import (
+    Case,
+    Panel,
+    bars,
+    box,
+    ground,
+    low_sun,
+    metal_box,
+    overcast,
+    sheet,
+    sunny,
+    surfels,
+    toward,
+)
+from tron.cameras import Camera
 from tron.estimation import PREVIEW, Estimation
 
 
@@ -37,6 +51,17 @@ def test_a_rough_floor_under_a_low_sun_is_right_on_both_sides(azimuth: float, ba
     case = low_sun(15, azimuth, 20, size=24, color=(base, base, base))
     ratio = hard_cases.over_truth(case, Estimation(rays=16))
     np.testing.assert_allclose(ratio, 1, atol=0.06)
+
+
+@pytest.mark.parametrize(("wall", "roughness"), [(True, 0.1), (True, 0.3), (False, 0.1)])
+def test_a_glossy_floor_mirrors_the_sun_where_no_wall_hides_it(wall: bool, roughness: float) -> None:
+    """Behind a wall a preview, which traces no reflection, was 824 and 149 times the truth."""
+    floor = ground(1.0, 0.04, base_color=(0.1, 0.1, 0.1), roughness=roughness)
+    panel = Panel((1.5, 0.7, 0), (-3, 0, 0), (0, 0, 2), cell=0.04, roughness=1.0)
+    x, y, z = 8 * toward(40, 180)
+    camera = Camera.look_at((x, y, z), (0, 0, 0), fov_deg=5, width=24, height=24)
+    case = Case([floor, panel] if wall else [floor], sunny(40, 0, 6), camera)
+    np.testing.assert_allclose(hard_cases.over_truth(case, PREVIEW), 1, atol=0.25)
 
 
 @pytest.mark.parametrize("light", ["sun", "overcast"])

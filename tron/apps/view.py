@@ -55,8 +55,8 @@ class Settings(BaseModel):
     projection: SeenAs = "auto"
     materials: Literal["kept", "auto", "as_is"] = Field(
         "kept",
-        description="of a scan without any; kept: those that tron-relight or auto has found, else guessed from "
-        "its colours; auto: found first, in minutes, and kept; as_is: guessed",
+        description="of a scan without any; kept: those that tron-relight has found, else guessed from its "
+        "colours; auto: found first, in minutes, and kept; as_is: guessed",
     )
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")

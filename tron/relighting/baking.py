@@ -144,7 +144,7 @@ def _radiance(light: Illumination, surface: Surface) -> np.ndarray:
     """(M, 3) linear radiance of the surfels along ``surface.direction``, as frames without rays have it."""
     arriving = arrived(surface)
     response = Response.of(surface, light.lighting.split_sum, light.estimation.brdf)
-    bounced = bounced_light(surface, arriving)
+    bounced = bounced_light(surface, arriving, response)
     assert bounced is not None
     radiance = response.lit(response.unshadowed * arriving.visibility, bounced)
     dr.eval(radiance)

@@ -60,7 +60,7 @@ def with_materials(
     found = _read(path, len(content))
     if found is None and not find:
         log.warning(
-            "%s has no materials: they are guessed from its colours; materials=auto finds them, once, in minutes",
+            "%s has no materials: they are guessed from its colours; materials=auto finds them, in minutes",
             kept.scan,
         )
         return scene

@@ -89,8 +89,8 @@ class Scan:
             up: direction of any length, in the file's frame; None: the file's own.
             projection: of its splats: the file's (auto), or disks in space.
             surroundings: what is done with a sky around it.
-            materials: those that are guessed are looked for (auto), taken from beside the file where they were
-                found before (kept), or stay (as_is).
+            materials: those that are guessed are looked for (auto), are those found before, where they are
+                kept (kept), or stay (as_is).
             seed: root of all random numbers.
             apart: folder of what is made of it once, where its own cannot be written.
             track: wraps long loops, ``track(items, label)``.

@@ -12,7 +12,8 @@ over the lobe of the scene that is in the way of the rest. kd and ks are those o
 Without reflection rays (:mod:`tron.shading.reflections`) M is I: the scene shines into the lobe as it does
 from everywhere. And o is (1 - roughness) openness + roughness E / U: a rough lobe sees what a diffuse surface
 sees, a mirror mostly something else than the sun that E is about. On training scenes that is 0.3 to 0.4 dB
-above openness alone.
+above openness alone. But radiance in the lobe far beyond U comes from lamps, which are most of U. Where most
+of U arrives they are seen; where little does they are hidden, and the lobe has no more of the rest than E.
 """
 
 from __future__ import annotations
@@ -34,6 +35,8 @@ if TYPE_CHECKING:
     from tron.tracing import Surface
 
 
+HIDDEN, SEEN = 0.25, 0.75
+"""E / U up to which the lamps that a lobe meets are hidden, and from which on they are seen."""
 CLEAR_TRANSMITTANCE = 0.25
 """From here on what lies behind is seen with its full share."""
 _END = 1 / 64
@@ -95,7 +98,7 @@ class Response:
 
 
 def evenly_bounced(
-    indirect: mi.Color3f, openness: mi.Float, visibility: mi.Color3f, roughness: mi.Float
+    indirect: mi.Color3f, openness: mi.Float, visibility: mi.Color3f, roughness: mi.Float, response: Response
 ) -> Bounced:
     """Bounced light without reflection rays: from everywhere alike.
 
@@ -104,9 +107,20 @@ def evenly_bounced(
         openness: share of the directions, by the cosine, in which nothing is met.
         visibility: E / U.
         roughness: in [0, 1].
+        response: U, and the lobe that is shared.
     """
-    share = dr.lerp(mi.Color3f(openness), dr.minimum(visibility, 1), roughness)
-    return Bounced(indirect, share, indirect)
+    direct = dr.minimum(visibility, 1)
+    share = dr.lerp(mi.Color3f(openness), direct, roughness)
+    even = response.lobe * response.unshadowed
+    beyond = dr.clip(_over(response.specular, even) - 1, 0, 1)
+    lamp = _over(dr.maximum(response.specular - dr.lerp(even, even * direct, beyond), 0), response.specular)
+    seen = dr.clip((direct - HIDDEN) / (SEEN - HIDDEN), 0, 1)
+    return Bounced(indirect, dr.lerp(share, seen, lamp), indirect)
+
+
+def _over(part: mi.Color3f, whole: mi.Color3f) -> mi.Color3f:
+    """Part over whole by channel; 0 where there is no whole."""
+    return dr.select(whole > 0, part / dr.select(whole > 0, whole, 1), 0)
 
 
 def background_share(transmittance: Array) -> Array:

@@ -248,7 +248,7 @@ def shade_surface(
     """
     response = Response.of(surface, lighting.split_sum, brdf)
     irradiance = response.unshadowed * arriving.visibility
-    bounced = bounced_light(surface, arriving)
+    bounced = bounced_light(surface, arriving, response)
     if background is None and arriving.behind is not None:
         behind = arriving.behind
     elif background is None:
@@ -269,13 +269,13 @@ def shade_surface(
     return buffers
 
 
-def bounced_light(surface: Surface, arriving: Arriving) -> Bounced | None:
+def bounced_light(surface: Surface, arriving: Arriving, response: Response) -> Bounced | None:
     """Light that has met the scene, of a surface with the values of a bake; None without."""
     if not surface.values:
         return None
     indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[BOUNCED_VALUES - 1]
     if arriving.mirror is None:
-        even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness)
+        even = evenly_bounced(indirect, openness, arriving.visibility, surface.roughness, response)
         return even if arriving.metals is None else with_mirror(even, arriving.metals, metal_share(surface))
     return Bounced(indirect, arriving.mirror.openness, arriving.mirror.radiance)
 

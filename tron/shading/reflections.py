@@ -261,7 +261,7 @@ def _returned(
     response = Response.of(surface, lighting.split_sum, brdf)
     openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
     visibility = ratio(direct, response.unshadowed, 1)
-    bounced = evenly_bounced(indirect, openness, visibility, surface.roughness)
+    bounced = evenly_bounced(indirect, openness, visibility, surface.roughness, response)
     further = metal_share(surface) * dr.clip((EVEN[1] - surface.roughness) / (EVEN[1] - EVEN[0]), 0, 1)
     metal = front & (further > 0)
     if seeds is not None and dr.any(metal):

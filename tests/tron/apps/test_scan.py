@@ -124,12 +124,20 @@ def test_a_baked_and_an_edited_scan_have_the_materials_of_a_relit_one(asked, fil
     from tron.apps import bake, edit
 
     (tmp_path / "edits.yaml").write_text("- {action: move, select: {object: 0}, by: [0, 0, 1]}")
-    edit.main(EditSettings(scene=file, edits=tmp_path / "edits.yaml", output=tmp_path / "edited.ply"))
+    edit.main(
+        EditSettings.model_validate(
+            {"scene": file, "edits": tmp_path / "edits.yaml", "output": tmp_path / "edited.ply"}
+        )
+    )
     edited = GaussianScene.load(tmp_path / "edited.ply")
     assert not edited.materials_guessed
     np.testing.assert_array_equal(edited.base_color[:, 1], np.float32(0.6))
     np.testing.assert_allclose(edited.means, GaussianScene.load(file).means + np.array([0, 0, 1]), atol=1e-6)
-    bake.main(BakeSettings(scene=file, environment=light_path, output=tmp_path / "baked.ply"))
+    bake.main(
+        BakeSettings.model_validate(
+            {"scene": file, "environment": light_path, "output": tmp_path / "baked.ply"}
+        )
+    )
     assert asked == [1]
     red, green, _ = np.median(GaussianScene.load(tmp_path / "baked.ply").sh[:, 0], axis=0)
     assert green > red
