@@ -37,8 +37,13 @@ def test_blocks_are_found():
 def test_the_commands_of_a_page_compose(page: Path):
     for line in commands(page):
         program, *words = shlex.split(line, comments=True)
+        folder = None
+        if "--config-dir" in words:
+            place = words.index("--config-dir")
+            folder = ROOT / words[place + 1]
+            del words[place : place + 2]
         command = get_object(SCRIPTS[program].replace(":", ".")).load()
         try:
-            check(compose_recipe(command.config_module, command.settings, words), command.settings)
+            check(compose_recipe(command.config_module, command.settings, words, folder), command.settings)
         except Exception as error:
             raise AssertionError(line) from error

@@ -7,7 +7,7 @@ not zero. The median is where the ray meets the plane of the surfel's own disk, 
 projection, which lies at one depth: light falls where the surface is.
 
 Where a ray meets two faces of an edge, a mean of their normals mirrors lamps that neither sees. The normal is
-one face's there, and on a ridge so is the point, unless they are differentiated: :func:`_of_one_face`.
+one face's there, and on a ridge so is the point, unless geometry is differentiated: :func:`_of_one_face`.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ class Surface:
         lift: mi.Float, distance to it from the first hit after which less than 0.9 of the light is left: how
             thick what stands for a surface is, world units; 0 where there is none. Not differentiated.
         normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0. Where faces meet it is that of
-            one; differentiated, it is the mean.
+            one; where geometry is differentiated it is the mean.
         normal_sum: mi.Normal3f, sum of ``w n`` before it is brought to unit length: shorter than the opacity
             where the surfels of a ray face several ways.
         base_color: mi.Color3f, linear.
@@ -81,7 +81,7 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     channels = sums.channels
     normal_sum = mi.Normal3f(*channels[0:3])
     normal, ridge = normal_sum, mi.UInt32(NO_SURFEL)
-    if not dr.grad_enabled(normal_sum):
+    if not dr.grad_enabled(records.geometry):  # materials are differentiated at what is drawn
         normal, ridge = _of_one_face(sums, records, origin, direction)
     squared = dr.squared_norm(normal)
     oriented = squared > 0
