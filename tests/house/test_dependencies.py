@@ -91,6 +91,9 @@ ASKED_FOR = {
     ("tron.editing.models", "tron.models.surfels"),
     ("tron.editing.edits", "tron.models.surfels"),
     ("tron.tracing.meshes", "tron.models.surfels"),
+    ("tron.tracing.meshes", "tron.models.sides"),
+    ("tron.editing.models", "tron.models.sides"),
+    ("tron.editing.edits", "tron.models.sides"),
     ("tron.apps.export", "tron.meshing.textures"),  # where a mesh is made: the same extra
     ("tron.apps.export", "tron.models.write"),
     ("tron.io.cameras.colmap", "tron.io.colmap"),  # pycolmap, of the extra `surfels`

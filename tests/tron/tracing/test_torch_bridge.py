@@ -41,7 +41,7 @@ def test_images_are_those_of_the_tracer(random_scene, device, degree):
     length = np.linalg.norm(expected["normal_sum"], axis=-1, keepdims=True)
     mean = expected["normal_sum"] / np.maximum(length, 1e-12)
     one_face = np.abs(mean - expected["normal"]).max(-1) > 1e-5
-    assert one_face.mean() < 0.1
+    assert one_face.mean() < 0.3
     expected["normal"] = mean  # what is differentiated is of no face alone, nor is its point
     expected["position"][one_face] = seen["position"].detach().cpu().numpy()[one_face]
     for name in IMAGES:
