@@ -6,6 +6,8 @@ of the kernel.
 
 from __future__ import annotations
 
+from dataclasses import replace
+
 import drjit as dr
 import mitsuba as mi
 import numpy as np
@@ -98,7 +100,7 @@ def test_hand_written_adjoint_is_what_local_differentiation_gives(random_scene, 
     restart()
     direction = rays.direction
     basis = sh_basis(direction.x, direction.y, direction.z)
-    weights = type(sums)(outer[:11], outer[11], outer[12], mi.Float(0), mi.Float(0), mi.UInt32(0))
+    weights = replace(type(sums).start(), channels=outer[:11], mean_depth=outer[11], transmittance=outer[12])
     (kept,) = hits[0]
     accumulate_gradients(records, sums, weights, kept, rays.origin, direction, basis)
     for name, hand, local in zip(buffers, by_hand, gradients(), strict=True):
