@@ -12,6 +12,7 @@ from eval.benchmark import Benchmark
 from eval.renderers.blender import INSTALL, blender_version
 from eval.report.outcome import Outcome
 from eval.stages import Stages
+from tron.cli.progress import track
 from tron.errors import TronError
 
 Part = Literal["cells", "sheets"]
@@ -94,7 +95,8 @@ class Zoo(Benchmark):
                 outcome.lack("zoo.psnr.preview_oidn", str(error))
                 oidn = False
         cells, shapes = [], {}
-        for shape, materials in individuals(self.shapes, self.materials, self.seed):
+        drawn = list(individuals(self.shapes, self.materials, self.seed))
+        for shape, materials in track(drawn, "shapes"):
             shapes[shape.kind, shape.number] = shape
             cells += measured(shape, materials, lights, self.seed, oidn, networks)
         outcome.add(zoo_rows(cells))
