@@ -35,6 +35,8 @@ if TYPE_CHECKING:
     from tron.tracing import Surface
 
 
+LAMP = 4.0
+"""Times U from which on radiance in a lobe is a lamp's; from twice that on the rest is what arrives, E."""
 HIDDEN, SEEN = 0.25, 0.75
 """E / U up to which the lamps that a lobe meets are hidden, and from which on they are seen."""
 CLEAR_TRANSMITTANCE = 0.25
@@ -112,8 +114,9 @@ def evenly_bounced(
     direct = dr.minimum(visibility, 1)
     share = dr.lerp(mi.Color3f(openness), direct, roughness)
     even = response.lobe * response.unshadowed
-    beyond = dr.clip(_over(response.specular, even) - 1, 0, 1)
-    lamp = _over(dr.maximum(response.specular - dr.lerp(even, even * direct, beyond), 0), response.specular)
+    beyond = dr.clip(_over(response.specular, even) / LAMP - 1, 0, 1)
+    rest = dr.lerp(LAMP * even, even * direct, beyond)
+    lamp = _over(dr.maximum(response.specular - rest, 0), response.specular)
     seen = dr.clip((direct - HIDDEN) / (SEEN - HIDDEN), 0, 1)
     return Bounced(indirect, dr.lerp(share, seen, lamp), indirect)
 
