@@ -230,7 +230,7 @@ def dataset(tmp_path_factory) -> Path:
                 frames=1,
                 width=16,
                 height=16,
-                cameras=[Camera.look_at((0, -4, 1), (0, 0, 0), fov_deg=35, width=16, height=16).to_dict()],
+                cameras=[Camera.look_at((0, -4, 1), (0, 0, 0), fov_deg=35, width=16, height=16).to_dict()],  # type: ignore[arg-type]
                 exposure=1.0,
                 color_space=dict.fromkeys((*light_members(), TARGET), "linear"),
             )

@@ -1,6 +1,7 @@
 """A network of one's own through tron-train: refused before step 1, or trained, resumed and read again."""
 
 import os
+import shutil
 import subprocess
 import sys
 import time
@@ -126,7 +127,8 @@ def test_the_example_is_installed_trained_killed_resumed_and_drawn_with(make_set
         "--target",
         site,
     ]
-    subprocess.run([*pip, str(OWN)], check=True)
+    shutil.copytree(OWN, tmp_path / "package")  # setuptools builds where the sources are
+    subprocess.run([*pip, str(tmp_path / "package")], check=True)
     beside = os.environ | {"PYTHONPATH": os.pathsep.join([str(site), *filter(None, sys.path)])}
     stage = "[{name: one, split: train, steps: 20, batch_size: 2, crop: 16}]"
     train = [

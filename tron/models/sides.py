@@ -97,7 +97,8 @@ def _seen(corners: np.ndarray, front: np.ndarray, bare: np.ndarray) -> np.ndarra
         bare: (B,) int.
     """
     rng = seeds.generator(0, "backs that are seen")
-    sizes = np.linalg.norm(np.cross(*(corners[bare, k] - corners[bare, 0] for k in (1, 2))), axis=1)
+    along, across = (corners[bare, k] - corners[bare, 0] for k in (1, 2))
+    sizes = np.linalg.norm(np.cross(along, across), axis=1)
     face, weights = spread(sizes, PROBES, rng)
     face = np.concatenate([np.arange(len(bare)), face])
     weights = np.concatenate([np.full((len(bare), 3), 1 / 3), weights])

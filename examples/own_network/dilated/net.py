@@ -36,9 +36,8 @@ class Dilated(Renderer):
                 nn.GELU(),
             ]
             channels = self.config.width
-        last = nn.Conv2d(channels, 3, 1)
+        last = nn.Conv2d(channels, 3, 1, bias=False)
         nn.init.zeros_(last.weight)  # a new network draws `lit` as it is
-        nn.init.zeros_(last.bias)
         self.layers = nn.Sequential(*layers, last)
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:

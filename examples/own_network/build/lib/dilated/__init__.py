@@ -1,1 +1,0 @@
-"""A neural renderer of one's own."""
