@@ -29,7 +29,6 @@ from tron.neural.configs import (
     PAPER_GUIDANCE,
     BackboneConfig,
     CosmosConfig,
-    GuidedConfig,
     RendererConfig,
     UNetConfig,
 )
@@ -52,7 +51,7 @@ def save_renderer(path: str | Path, renderer: Renderer) -> None:
     Raises:
         TronError: the class could not be found again (`kind_of`).
     """
-    header = {"format": FORMAT, "kind": kind_of(renderer), "config": _plain(renderer.config)}
+    header = {"format": FORMAT, "kind": kind_of(renderer), "config": renderer.config.model_dump(mode="json")}
     state = {name: tensor.detach().cpu().contiguous() for name, tensor in renderer.state_dict().items()}
     # One key, since safetensors writes several in the order of a hash that changes from run to run.
     write_atomic(path, serialize(state, {METADATA_KEY: json.dumps(header)}))
@@ -67,7 +66,7 @@ def require_saved(renderer: Renderer) -> None:
     if kind in OURS:
         return
     try:
-        again = _build(kind, _plain(renderer.config), None)
+        again = _build(kind, renderer.config.model_dump(mode="json"), None)
     except Exception as error:
         raise TronError(
             f"{kind} cannot be made from its settings alone: {error}",
@@ -79,10 +78,6 @@ def require_saved(renderer: Renderer) -> None:
         raise TronError(
             f"{kind} made again from its settings has another '{name}'", mend="let config decide every shape"
         )
-
-
-def _plain(config: GuidedConfig) -> dict[str, Any]:
-    return json.loads(json.dumps(config.model_dump(mode="json")))
 
 
 def load_renderer(path: str | Path, vae: str | Path | None = None) -> Renderer:

@@ -114,16 +114,17 @@ def evenly_bounced(
     direct = dr.minimum(visibility, 1)
     share = dr.lerp(mi.Color3f(openness), direct, roughness)
     even = response.lobe * response.unshadowed
-    beyond = dr.clip(_over(response.specular, even) / LAMP - 1, 0, 1)
+    beyond = dr.clip(ratio(response.specular, even, 0) / LAMP - 1, 0, 1)
     rest = dr.lerp(LAMP * even, even * direct, beyond)
-    lamp = _over(dr.maximum(response.specular - rest, 0), response.specular)
+    lamp = ratio(dr.maximum(response.specular - rest, 0), response.specular, 0)
     seen = dr.clip((direct - HIDDEN) / (SEEN - HIDDEN), 0, 1)
     return Bounced(indirect, dr.lerp(share, seen, lamp), indirect)
 
 
-def _over(part: mi.Color3f, whole: mi.Color3f) -> mi.Color3f:
-    """Part over whole by channel; 0 where there is no whole."""
-    return dr.select(whole > 0, part / dr.select(whole > 0, whole, 1), 0)
+def ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
+    """Part over whole by channel; ``otherwise`` where there is no whole."""
+    pairs = zip(part, whole, strict=True)
+    return mi.Color3f(*[dr.select(b > 0, a / dr.select(b > 0, b, 1), otherwise) for a, b in pairs])
 
 
 def background_share(transmittance: Array) -> Array:

@@ -36,7 +36,7 @@ from tron.brdf.table import BrdfTable
 from tron.estimation import Brdf, Estimation
 from tron.seeds import integer
 from tron.shading.bounces.bounce import BouncedLight
-from tron.shading.composition import Bounced, Response, evenly_bounced
+from tron.shading.composition import Bounced, Response, evenly_bounced, ratio
 from tron.shading.direct.irradiance import ORIGIN_OFFSET
 from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.sampling import PixelPoints
@@ -228,12 +228,6 @@ def ray_weights(
     total = own + other
     balance = dr.select(total > 0, own / dr.select(total > 0, total, 1), 0)
     return weight, weight * balance, lighting.light.radiance(direction)
-
-
-def ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
-    """Part over whole by channel; ``otherwise`` where there is no whole."""
-    pairs = zip(part, whole, strict=True)
-    return mi.Color3f(*[dr.select(b > 0, a / dr.select(b > 0, b, 1), otherwise) for a, b in pairs])
 
 
 def _returned(
