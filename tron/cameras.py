@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from tron.camera_record import CameraRecord
 from tron.errors import TronError
 from tron.framing import Surfels, find_subject, framed, outward
 
@@ -216,7 +217,7 @@ class Camera:
             pixels = local[:, :2] / depth[:, None] * (self.fx, self.fy) + (self.cx, self.cy)
         return pixels, depth
 
-    def to_dict(self) -> dict[str, Any]:
+    def to_dict(self) -> CameraRecord:
         """Plain numbers and lists, for JSON; floats survive the round trip exactly."""
         return {
             "fx": float(self.fx),

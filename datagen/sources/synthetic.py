@@ -469,7 +469,7 @@ def _meta(
         frames=len(cameras),
         width=recipe.width,
         height=recipe.height,
-        cameras=[camera.to_dict() for camera in cameras],  # type: ignore[arg-type]
+        cameras=[camera.to_dict() for camera in cameras],
         exposure=lit.exposure,
         color_space=color_spaces(recipe.reference_buffers),
         seeds={"root": spec.seed, **{f"{what}0": values[0] for what, values in lit.seeds.items()}},

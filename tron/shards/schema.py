@@ -13,9 +13,9 @@ from pathlib import Path
 from typing import Annotated, Any, Literal
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field, FiniteFloat
-from typing_extensions import TypedDict
+from pydantic import BaseModel, ConfigDict, Field
 
+from tron.camera_record import CameraRecord
 from tron.color import agx, linear_to_srgb
 from tron.errors import TronError
 
@@ -158,26 +158,7 @@ def members_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-_Row = Annotated[list[FiniteFloat], Field(min_length=4, max_length=4)]
 _Side = Annotated[int, Field(ge=1, le=16_384)]
-
-
-class CameraRecord(TypedDict):
-    """A pinhole camera, as `Camera.to_dict` gives it: OpenCV axes (x right, y down, z forward).
-
-    fx, fy, cx, cy are in pixels; the centre of column i, row j is at (i + 0.5, j + 0.5). world_to_camera is a
-    rigid 4 x 4 matrix, row after row.
-    """
-
-    __pydantic_config__ = ConfigDict(extra="forbid")  # type: ignore[misc]
-
-    fx: Annotated[FiniteFloat, Field(gt=0)]
-    fy: Annotated[FiniteFloat, Field(gt=0)]
-    cx: FiniteFloat
-    cy: FiniteFloat
-    width: _Side
-    height: _Side
-    world_to_camera: Annotated[list[_Row], Field(min_length=4, max_length=4)]
 
 
 class ClipMeta(BaseModel):
