@@ -27,7 +27,7 @@ CODE = {
     "tron/shading": (4_850, 24),
     "tron/shards": (1_980, 10),
     "tron/tracing": (4_800, 23),
-    "tron/view": (2_450, 12),
+    "tron/view": (2_650, 13),
     "conf": (50, 12),
     "datagen": (20_050, 129),
     "train": (3_290, 22),

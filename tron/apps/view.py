@@ -5,7 +5,7 @@ from __future__ import annotations
 import logging
 import time
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
@@ -55,8 +55,8 @@ class Settings(BaseModel):
     projection: SeenAs = "auto"
     materials: Literal["kept", "auto", "as_is"] = Field(
         "kept",
-        description="of a scan without any; kept: those that tron-relight has found, else guessed from its "
-        "colours; auto: found first, in minutes, and kept; as_is: guessed",
+        description="of a scan without any; kept: those that were found before, else guessed from its "
+        "colours until a button of the page finds them; auto: found while those are shown; as_is: guessed",
     )
     up: Up = None
     seed: int = Field(0, description="root of all random numbers")
@@ -95,6 +95,7 @@ def opened(settings: Settings) -> Window:
     """
     # viser and Mitsuba: not for --help
     from tron.shading.environments.environment import EnvironmentMap
+    from tron.view.finding import MaterialSearch
     from tron.view.opening import files_of, finish_of, first_light, home_of
     from tron.view.window import Window, require_free_port
 
@@ -108,16 +109,21 @@ def opened(settings: Settings) -> Window:
     first = first_light(lights, settings.light, own, settings.environments)
     require_free_port(settings.host, settings.port)
     activate(settings.variant, settings.threads)
+    given: dict[str, Any] = {
+        "up": settings.up, "projection": settings.projection, "seed": settings.seed, "apart": output,
+    }  # fmt: skip
     with working("reading the scene"):
-        scan = Scan.open(
-            settings.scene, up=settings.up, projection=settings.projection, materials=settings.materials,
-            seed=settings.seed, apart=output, track=track, key="",
-        )  # fmt: skip
+        materials = "as_is" if settings.materials == "as_is" else "kept"
+        scan = Scan.open(settings.scene, **given, materials=materials, track=track, key="")
         turned = {name: scan.over(EnvironmentMap.load(file), file) for name, file in own.items()}
+    search = None
+    if settings.materials != "as_is":
+        search = MaterialSearch(settings.scene, given, settings.ground, settings.variant, settings.threads)
     return Window(
         scan.in_file, settings.scene, lights, models, output, settings.host, settings.port,
-        home_of(scan.loaded), turned, first, about=scan.about(settings.ground), seed=scan.root,
-        variant=settings.variant, threads=settings.threads, finish=finish_of(settings.threads),
+        home_of(scan.loaded), turned, first, search, settings.materials == "auto",
+        about=scan.about(settings.ground), seed=scan.root, variant=settings.variant,
+        threads=settings.threads, finish=finish_of(settings.threads),
     )  # fmt: skip
 
 

@@ -75,7 +75,7 @@ class Scan:
         surroundings: Treatment = "drop",
         materials: Materials = "auto",
         seed: int = 0,
-        apart: Path = APART,
+        apart: str | Path = APART,
         track: Track = lambda items, _: items,
         key: str = "surroundings",
         standing: bool = True,
@@ -117,7 +117,7 @@ class Scan:
                 "its side, give up=[0,0,1] or another direction", file,
             )  # fmt: skip
         scene.up_guessed = False
-        return cls(file, scene, seed, surroundings, materials, apart, track, key, standing)
+        return cls(file, scene, seed, surroundings, materials, Path(apart), track, key, standing)
 
     @property
     def offset(self) -> np.ndarray:

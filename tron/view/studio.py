@@ -38,6 +38,8 @@ from tron.view.stage import SUB_PIXELS, Part, Stage, Wish, bands
 
 log = logging.getLogger(__name__)
 T = TypeVar("T")
+Opener = Callable[[], tuple[GaussianScene, Mapping[str, Any] | None]]
+"""Gives a scene, and what a stage is told of it."""
 
 REST_SECONDS = 0.25
 """Since the last input, from which on nothing moves: inputs of a hand come faster, 20 a second."""
@@ -125,7 +127,10 @@ class Studio:
     ) -> None:
         if not lights:
             raise TronError("there is no light", mend="give one at least")
-        self._make = lambda: Stage(scene, lights, home, seed, self._watch, busy, about)
+        self._make: Callable[..., Stage] = lambda scene, about: Stage(
+            scene, lights, home, seed, self._watch, busy, about
+        )
+        self._of: Opener | None = lambda: (scene, about)  # what is to be opened
         self._machine = variant, threads
         self._show, self._notice, self._finish, self._busy = show, notice, finish, busy
         self._changed = threading.Condition()
@@ -192,6 +197,20 @@ class Studio:
                 self._changed.notify()
         return answer
 
+    def reopen(self, of: Opener) -> None:
+        """Show another scene from now on, of as many surfels; wishes, edits among them, are done to it.
+
+        Args:
+            of: called on the studio's thread. Where it fails that is a notice, and what was shown goes on.
+        """
+        with self._changed:
+            self._of, self._refused = of, None
+            self._version += 1
+            self._wishes += 1
+            for view in self._views.values():
+                view.level = 0
+            self._changed.notify()
+
     def close(self) -> None:
         """End the thread; what is under way is given up. Safe to repeat."""
         with self._changed:
@@ -224,19 +243,30 @@ class Studio:
                         answer.cancel()
                     return
                 self._began, wish, number = self._version, self._wish, self._wishes
+                of = self._of
                 rough = time.perf_counter() - self._moved < REST_SECONDS
             try:
                 with _ONE_AT_A_TIME:
-                    if stage is None:
+                    if of is not None:
                         activate(*self._machine)
-                        stage = self._make()
+                        stage = self._make(*of())
+                        self._opened(of)
+                    assert stage is not None
                     self._work(stage, wish, number, rough)
             except _Outdated:
                 pass
             except Exception as error:
+                if stage is not None:  # what was shown goes on
+                    self._opened(of)
                 if not isinstance(error, TronError):
                     log.exception("drawing failed")
                 self._refuse(wish, number, str(error) or type(error).__name__)
+
+    def _opened(self, of: Callable[..., Any] | None) -> None:
+        """A scene is there, or cannot be opened; another may have come meanwhile."""
+        with self._changed:
+            if self._of is of:
+                self._of = None
 
     def _wait(self) -> None:
         """Until there is something to do; holds the lock."""

@@ -29,6 +29,7 @@ from tron.gaussians.scene import GaussianScene, rotation_matrices
 from tron.shading.environments.environment import EnvironmentMap
 from tron.view.cutting import Cutting
 from tron.view.filming import Filming
+from tron.view.finding import MaterialSearch
 from tron.view.history import HAND_SECONDS, History
 from tron.view.objects import Objects
 from tron.view.saving import Saving
@@ -54,6 +55,7 @@ ABOVE = 4.0
 EVERYWHERE = "0.0.0.0"
 """Host that stands for all addresses of the machine."""
 GUESSED = "*Materials are guessed from the scan's colours, which keep the light of its capture.*"
+FOUND = "*Materials were found and are kept beside the scan.*"
 BRAND = (232, 150, 60)
 
 
@@ -103,6 +105,8 @@ class Window:
         home: the first view, where up is +z.
         turned: lights that stand otherwise than in their files, by name.
         light: name of the first one; None: the first of them.
+        search: finds materials where they are guessed; None: nothing does.
+        searching: whether it begins at once, not by a button.
         studio: more arguments of :class:`tron.view.studio.Studio`.
 
     Raises:
@@ -121,6 +125,8 @@ class Window:
         home: Camera,
         turned: Mapping[str, EnvironmentMap] | None = None,
         light: str | None = None,
+        search: MaterialSearch | None = None,
+        searching: bool = False,
         **studio: Any,
     ) -> None:
         require_free_port(host, port)
@@ -142,6 +148,7 @@ class Window:
         subject = find_subject(scene.upright())
         self._frame(home, subject.centre)
         first = light or next(iter(lights))
+        self._search = search if scene.materials_guessed else None
         self._build(subject.radius, first, file, folder, scene.offset, scene.materials_guessed)
         self._closed = False
         self.studio = Studio(
@@ -153,9 +160,13 @@ class Window:
         self._server.scene.on_click()(lambda event: self._click(event, shift=False))
         self._server.scene.on_click(modifier="shift")(lambda event: self._click(event, shift=True))
         threading.Thread(target=self._follow, daemon=True).start()
+        if searching:
+            self._find()
 
     def close(self) -> None:
-        """End the studio's thread, then the server."""
+        """End the search, the studio's thread, then the server."""
+        if self._search is not None:
+            self._search.close()
         self.studio.close()
         with self._pictures:
             self._closed = True
@@ -182,7 +193,11 @@ class Window:
         gui = self._server.gui
         gui.add_html(folded_on_phones(), order=-3)
         if guessed:
-            gui.add_markdown(GUESSED, order=-2)
+            self._materials = gui.add_markdown(GUESSED, order=-2)
+        if self._search is not None:
+            hint = "minutes; pictures go on meanwhile. What is found is kept, for tron-relight too"
+            self._finder = gui.add_button("Find materials", order=-2, hint=hint)
+            self._finder.on_click(lambda _: self._find())
         self._buffer = gui.add_dropdown("Show", BUFFERS, initial_value="lit", hint="what the picture is of")
         self._buffer.on_update(lambda _: self._want(buffer=self._buffer.value))
         self._quality = gui.add_dropdown(
@@ -237,6 +252,28 @@ class Window:
 
     def _want(self, **changes: Any) -> None:
         self.studio.wish(**changes)
+
+    def _find(self) -> None:
+        """Look for materials, beside the window, and show them when they are there."""
+        if self._search is None or self._finder.disabled:
+            return
+        self._finder.disabled = True
+        self._materials.content = "*Finding materials …*"
+        self._search.begin(self._finding, self._found)
+
+    def _finding(self, about: str, share: float) -> None:
+        self._materials.content = f"*Finding materials: {about} · {share:.0%}*"
+
+    def _found(self, why: str) -> None:
+        if self._closed or self._search is None:
+            return
+        if why:
+            self._materials.content = f"{GUESSED} *They were not found: {why}*"
+            self._finder.disabled = False
+            return
+        self._finder.remove()
+        self._materials.content = FOUND
+        self.studio.reopen(self._search.reopened)
 
     def _choose_light(self) -> None:
         self._want(light=self._light.value)
