@@ -54,6 +54,10 @@ SMOOTHEST = 0.02
 """Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
 EVEN = (0.6, 0.9)
 """Roughness up to which a metal that is met sends a ray on, and from which on bounced light is as good."""
+ROUGHER = 0.5
+"""Share of a lobe's alpha that what it meets has besides its own. A few rays of a rough floor seldom find the
+sun in a polished ball, and are white specks where they do (Kaplanyan and Dachsbacher 2013, "Path Space
+Regularization for Holistic and Robust Light Transport")."""
 ROUGH = 0.2
 """Roughness from which on neighbours' rays count in full; a mirror keeps its own."""
 UNLIKE = 10.0
@@ -129,7 +133,7 @@ def reflections(
                 )
                 met = hit.surfel != NOTHING
                 further = ray_seeds(again, pixel, ray)
-                returned = _returned(tracer, hit, direction, lighting, bounce, brdf, further)
+                returned = _returned(tracer, hit, direction, lighting, bounce, brdf, further, lobe.alpha)
                 sums["met"] += dr.select(met, weight * returned, 0)
                 sums["light"] += share * radiance
                 sums["escaped"] += dr.select(met, 0, share * radiance)
@@ -238,10 +242,12 @@ def _returned(
     bounce: BouncedLight,
     brdf: Brdf,
     seeds: mi.UInt32 | None = None,
+    wide: mi.Float | None = None,
 ) -> mi.Color3f:
     """Radiance that what is met sends back along ``direction``; 0 where nothing is.
 
-    ``seeds``: of the rays that metals which are met send on; None: they send none.
+    ``seeds``: of the rays that metals which are met send on; None: they send none. ``wide``: alpha of the
+    lobe that the ray is of, by which what is met is rougher (:data:`ROUGHER`); None: it is not.
     """
     met = hit.surfel != NOTHING
     front = met & hit.front
@@ -251,6 +257,9 @@ def _returned(
 
     surface = centres(tracer.records, hit.surfel, front)
     surface.direction = direction
+    if wide is not None:
+        alpha = dr.hypot(dr.square(surface.roughness), ROUGHER * wide)
+        surface.roughness = dr.minimum(dr.sqrt(alpha), 1)
     direct, indirect = of(bounce.direct, front), of(bounce.indirect, front)
     response = Response.of(surface, lighting.split_sum, brdf)
     openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)

@@ -7,9 +7,13 @@ import mitsuba as mi
 import numpy as np
 import pytest
 
+from examples.stage import BALL, make_scene
 from tron.brdf.reflectance import Layers, fresnel, reflectance
 from tron.brdf.table import BrdfTable
+from tron.estimation import Estimation
+from tron.relighting import Relighter
 from tron.seeds import generator
+from tron.shading import reflections as reflection_rays
 from tron.shading.reflections import Lobe
 
 N = 1 << 18
@@ -58,3 +62,20 @@ def test_rays_are_drawn_by_their_density(variant: str, cosine: float, roughness:
         drawn = np.array(above & part(out)).mean()
         integral = np.array(dr.select(part(everywhere), density, 0), np.float64).mean()
         assert drawn == pytest.approx(integral, abs=0.015)
+
+
+def test_a_rough_floor_has_few_white_specks_beside_a_polished_ball(variant, sun_map, camera, monkeypatch):
+    """Its lobe is noisier where mirrors in it are as sharp as they are; in the mean it is as bright."""
+    scene = make_scene(0.1)
+    ball = scene.object_id == BALL
+    scene.metallic[:], scene.roughness[:] = ball, np.where(ball, 0.05, 0.5)
+    found = {}
+    for share in (0.0, reflection_rays.ROUGHER):
+        monkeypatch.setattr(reflection_rays, "ROUGHER", share)
+        under = Relighter(scene, Estimation(reflections=4), proxy="never").under(sun_map)
+        frames = np.stack([under.render(camera, seed).lit for seed in range(8)])
+        rough = np.abs(under.render(camera, 0).gbuffer["roughness"] - 0.5) < 0.01
+        found[share] = frames[:, rough].mean(), frames[:, rough].std(0).max()
+    (mean, noise), (other, less) = found.values()
+    assert other == pytest.approx(mean, rel=0.01)
+    assert less < 0.7 * noise
