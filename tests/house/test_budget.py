@@ -20,7 +20,7 @@ CODE = {
     "tron/meshing": (350, 3),
     "tron/models": (2_150, 13),
     "tron/neural": (2_400, 23),
-    "tron/reconstruction": (6_800, 35),
+    "tron/reconstruction": (6_770, 35),
     "tron/relighting": (1_400, 6),
     "tron/report": (650, 5),
     "tron/scans": (850, 6),
