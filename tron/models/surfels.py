@@ -8,7 +8,6 @@ triangles of their own by :mod:`tron.models.sides`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -19,8 +18,6 @@ from tron.errors import TronError
 from tron.gaussians.initialize import surfels_from_points
 from tron.gaussians.scene import GaussianScene
 from tron.models.parts import Part, Sampling
-
-log = logging.getLogger(__name__)
 
 POINTS = 12
 """Points a surfel."""
