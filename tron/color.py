@@ -143,6 +143,6 @@ def _agx_sigmoid(xp: Any, x: Any) -> Any:
     return xp.clip(py + shoulder - toe, 0.0, 1.0)
 
 
-def to_display(linear: Any, exposure: Any, axis: int = -1, look: Look = "none") -> Any:
+def to_display(linear: Any, exposure: Any, look: Look = "none") -> Any:
     """``agx(exposure * linear)``: display values in [0, 1]; the exposure is a factor, not stops."""
-    return agx(exposure * linear, axis=axis, look=look)
+    return agx(exposure * linear, look=look)

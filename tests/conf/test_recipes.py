@@ -24,7 +24,6 @@ from tron.cli.recipes import (
     nested_model,
     resolve,
 )
-from tron.errors import TronError
 from tron.run_folder import leaves, nested_items
 
 ROOT = Path(__file__).resolve().parents[2]
@@ -150,21 +149,6 @@ def only_targets(values: dict[str, Any]) -> dict[str, Any]:
     inner = {name: only_targets(value) for name, value in values.items() if isinstance(value, dict)}
     named = {"_target_": values["_target_"]} if "_target_" in values else {}
     return named | {name: value for name, value in inner.items() if value}
-
-
-@pytest.mark.parametrize(
-    ("folder", "before", "now"),
-    [
-        ("relight", "diffuse", "brdf"),
-        ("datagen", "diffuse", "brdf"),
-        ("reconstruct", "light.diffuse", "light.brdf"),
-    ],
-)
-def test_a_key_of_earlier_versions_is_told_by_its_new_name(folder: str, before: str, now: str):
-    """Nothing near resembles it: tron-datagen asked for a radius."""
-    command = load_command(folder)
-    with pytest.raises(TronError, match=f"'{before}'.*did you mean '{now}'"):
-        compose_recipe(command.config_module, command.settings, [f"{before}=principled"])
 
 
 @pytest.mark.parametrize("folder", sorted(COMMANDS))

@@ -43,9 +43,8 @@ def render_help(
     defaults: Mapping[str, Any],
     groups: Mapping[str, Mapping[str, str]],
     examples: Sequence[str],
-    columns: int | None = None,
 ) -> str:
-    """The whole page as text.
+    """The whole page as text, as wide as the terminal but at most 110 columns.
 
     Args:
         name: the command, such as `tron-relight`.
@@ -54,9 +53,8 @@ def render_help(
         defaults: the composed configuration without overrides, nested; it wins over the model's defaults.
         groups: group -> option -> one line about it.
         examples: whole command lines.
-        columns: width; the terminal's (at most 110) where None.
     """
-    width = columns or min(shutil.get_terminal_size().columns, 110)
+    width = min(shutil.get_terminal_size().columns, 110)
     page = [
         *_reflow(purpose, width),
         "",

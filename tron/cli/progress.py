@@ -43,7 +43,7 @@ class Progress:
 
     def __init__(self, label: str, total: float | None, start: float = 0, unit: str = "") -> None:
         self._label, self._total, self._unit = label, total, f" {unit}" if unit else ""
-        self._start = self._done = start
+        self._done = start
         self._began = self._last_line = time.monotonic()
         self._first: tuple[float, float] | None = None  # when the first piece was done, and how much was then
         self._lines = self._tenths(start)

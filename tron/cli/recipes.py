@@ -36,7 +36,6 @@ Settings = TypeVar("Settings", bound=pydantic.BaseModel)
 OWN_PACKAGES = ("tron", "datagen", "train", "eval")  # classes of others keep their defaults to themselves
 SHARED_GROUP = "fidelity"  # beside the folders of the commands: a file has a part for each that it concerns
 SHOWN_CHARACTERS = 80  # of a wrong value, so that the error stays one readable line
-RENAMED = {"diffuse": "brdf"}  # keys of earlier versions, which nothing near resembles
 
 
 def compose_recipe(
@@ -243,10 +242,6 @@ def unknown_key(key: str, known: Sequence[str], beside: Sequence[str] = ()) -> T
 
 def did_you_mean(name: str, known: Sequence[str]) -> str:
     """`"did you mean 'x'? "`, or nothing where no known name is near."""
-    parent, dot, leaf = name.rpartition(".")
-    renamed = parent + dot + RENAMED.get(leaf, leaf)
-    if renamed != name and renamed in known:
-        return f"did you mean '{renamed}'? "
     near = difflib.get_close_matches(name, known, n=1, cutoff=0.6)
     if not near:  # the right leaf under the wrong parent: `frames` for `trajectory.frames`
         leaves = {each.rpartition(".")[2]: each for each in known}

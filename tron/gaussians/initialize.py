@@ -31,6 +31,10 @@ from tron.gaussians.scene import (
 
 # Surfels far from all others (grazing views, lone pixels) would cover their surroundings.
 SCALE_CAP = 3.0
+_SCALES = {2: 0.6, 4: 0.4}
+"""By degree of the kernel: deviation of a surfel over the root mean square distance to the three nearest that
+face the same way."""
+_OPACITY = 0.99
 
 # More samples than this are first merged in cells FINE times smaller than those of the surfels.
 _SAMPLES_AT_ONCE = 2_000_000
@@ -79,8 +83,6 @@ def surfels_from_gbuffers(
     views: Iterable[GBufferView],
     count: int = 20000,
     kernel_degree: int = 4,
-    scale: float = 0.4,
-    opacity: float = 0.99,
     up: Sequence[float] = (0.0, 0.0, 1.0),
     *,
     detail: bool = False,
@@ -96,9 +98,6 @@ def surfels_from_gbuffers(
         views: of one world.
         count: surfels wanted.
         kernel_degree: 2 or 4.
-        scale: standard deviation of a surfel over the root mean square distance to the three nearest that
-            face the same way; it belongs to the degree: 0.4 for 4, 0.6 for 2.
-        opacity: of every surfel, in (0, 1).
         up: (3,) unit, world.
         detail: surfels are smaller where base color, normals or materials vary, larger elsewhere, and have
             the shape of what they stand for. It takes half as long again.
@@ -112,7 +111,7 @@ def surfels_from_gbuffers(
     samples = _gather(views, count)
     if not len(samples.weight):
         raise TronError("no view sees any surface, so there are no surfels to make")
-    return _surfels(samples, count, kernel_degree, scale, opacity, up, detail)
+    return _surfels(samples, count, kernel_degree, up, detail)
 
 
 def surfels_from_points(
@@ -120,30 +119,25 @@ def surfels_from_points(
     object_id: int,
     count: int,
     kernel_degree: int = 4,
-    scale: float = 0.4,
-    opacity: float = 0.99,
-    up: Sequence[float] = (0.0, 0.0, 1.0),
 ) -> GaussianScene:
     """The same of one object's points, which lie evenly on its surface.
 
     Args:
         values: position, normal (unit), base_color (linear), (N, 3) each, and roughness, metallic, (N, 1).
         object_id: of the surfels.
-        count, kernel_degree, scale, opacity, up: as of :func:`surfels_from_gbuffers`.
+        count, kernel_degree: as of :func:`surfels_from_gbuffers`.
     """
     given = {name: np.asarray(array, np.float32) for name, array in values.items()}
     number = len(given["position"])
     samples = Samples(given, np.ones(number), np.full(number, object_id, np.int64))
-    return _surfels(samples, count, kernel_degree, scale, opacity, up)
+    return _surfels(samples, count, kernel_degree)
 
 
 def _surfels(
     samples: Samples,
     count: int,
     kernel_degree: int,
-    scale: float,
-    opacity: float,
-    up: Sequence[float],
+    up: Sequence[float] = (0.0, 0.0, 1.0),
     detail: bool = False,
 ) -> GaussianScene:
     has_rgb = "rgb" in samples.values
@@ -167,8 +161,8 @@ def _surfels(
     return GaussianScene(
         means=means,
         quats=quats,
-        log_scales=np.log(scale * sides),
-        opacity_logits=np.full(len(means), logit(opacity)),
+        log_scales=np.log(_SCALES[kernel_degree] * sides),
+        opacity_logits=np.full(len(means), logit(_OPACITY)),
         sh=sh,
         base_color=base_color,
         roughness=np.clip(samples.values["roughness"][:, 0], 0, 1),

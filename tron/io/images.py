@@ -145,15 +145,15 @@ def _levels(image: np.ndarray) -> np.ndarray:
     return image[..., 0] if image.shape[2] == 1 else image
 
 
-def decode_png(data: bytes, color: bool = True) -> np.ndarray:
+def decode_png(data: bytes) -> np.ndarray:
     """Decode a PNG or JPEG to (H, W, C) float32 sRGB display values in [0, 1], without a word.
 
-    Orientation tags are not applied; ``color`` is as in :func:`read_image`.
+    Orientation tags are not applied.
 
     Raises:
         TronError: not such an image, damaged, too large, or of a colour space that is not converted.
     """
-    return _open_display(data, color)[0]
+    return _open_display(data, color=True)[0]
 
 
 def _open_display(data: bytes, color: bool) -> tuple[np.ndarray, list[str]]:

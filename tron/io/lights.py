@@ -25,9 +25,8 @@ from tron.color import srgb_to_linear
 from tron.errors import TronError, located, say_once
 from tron.io.color_spaces import chromaticities_of, in_bt709
 from tron.io.cube_files import DDS, KTX2, open_cube
-from tron.io.image_headers import AGAIN, MAX_DECODED_BYTES, check_size
+from tron.io.image_headers import AGAIN, JXL, MAX_DECODED_BYTES, check_size, jpeg_xl_size
 from tron.io.images import read_image
-from tron.io.jpeg_xl import JXL, jpeg_xl_size
 from tron.io.lat_long import directions, resampled
 from tron.io.optional import codecs
 

@@ -8,7 +8,6 @@ triangles of their own by :mod:`tron.models.sides`.
 
 from __future__ import annotations
 
-import logging
 from collections.abc import Sequence
 
 import numpy as np
@@ -20,12 +19,9 @@ from tron.gaussians.initialize import surfels_from_points
 from tron.gaussians.scene import GaussianScene
 from tron.models.parts import Part, Sampling
 
-log = logging.getLogger(__name__)
-
 POINTS = 12
 """Points a surfel."""
 MOST = 2_000_000
-_SCALES = {2: 0.6, 4: 0.4}  # of a surfel over its spacing, by degree
 _MODES = {"repeat": "grid-wrap", "mirror": "reflect", "clamp": "nearest"}
 
 
@@ -54,9 +50,7 @@ def surfels_of_model(
     numbers = rng.multinomial(round(POINTS * count), [each.sum() / area for each in sizes])
     drawn = [_points(*each, rng) for each in zip(parts, sizes, numbers) if each[2]]
     values = {name: np.concatenate([each[name] for each in drawn]) for name in drawn[0]}
-    return surfels_from_points(
-        values, object_id, round(count), kernel_degree, _SCALES[kernel_degree], up=(0.0, 0.0, 1.0)
-    )
+    return surfels_from_points(values, object_id, round(count), kernel_degree)
 
 
 def areas(part: Part) -> np.ndarray:

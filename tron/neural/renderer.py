@@ -20,7 +20,6 @@ from tron.neural.kernels import filtered, gaussian_logits
 from tron.neural.networks.unet import UNet
 from tron.neural.protocols import Codec, Renderer
 from tron.neural.scales import halved, with_coarse
-from tron.neural.tiles import drawn_in_tiles
 
 if TYPE_CHECKING:
     from tron.neural.networks.backbone import Backbone
@@ -28,6 +27,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
+TILE = 1024
+"""Side of a tile of a large picture, without its margin, pixels."""
 BLUR_SIDE = 5
 """Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
 REACH = 96
@@ -306,3 +307,42 @@ def render_frames(
 def _joined(frames: list[dict[str, Tensor]]) -> dict[str, Tensor]:
     """Frames (1, 3, 1, H, W) by name, one after another: (1, 3, K, H, W)."""
     return {name: torch.cat([frame[name] for frame in frames], 2) for name in frames[0]}
+
+
+def drawn_in_tiles(
+    renderer: Renderer,
+    buffers: Mapping[str, Tensor],
+    weights: Mapping[str, float] | None = None,
+    side: int = TILE,
+) -> Tensor:
+    """:meth:`Renderer.forward` of frames (B, 3, K, H, W), tile by tile where they are larger than one.
+
+    A pixel depends on those within the network's reach. Tiles begin at multiples of its stride and are given
+    the reach as margin, so that they draw what one pass over the whole draws; the shipped ones within 1/255.
+
+    Args:
+        side: of a tile, pixels, brought up to the network's stride. Networks that look at the whole picture
+            (``renderer.reach`` is None) draw it whole.
+    """
+    height, width = next(iter(buffers.values())).shape[-2:]
+    reach, stride = renderer.reach, renderer.stride
+    if reach is None or max(height, width) <= side + reach:
+        return renderer(buffers, weights)
+    side, margin = (-(-pixels // stride) * stride for pixels in (side, reach))
+    drawn: list[Tensor] = []
+    for rows, seen_rows in _spans(height, side, margin):
+        across = []
+        for columns, seen_columns in _spans(width, side, margin):
+            seen = {name: buffer[..., seen_rows, seen_columns] for name, buffer in buffers.items()}
+            top, left = rows.start - seen_rows.start, columns.start - seen_columns.start
+            tall, wide = rows.stop - rows.start, columns.stop - columns.start
+            across.append(renderer(seen, weights)[..., top : top + tall, left : left + wide])
+        drawn.append(torch.cat(across, -1))
+    return torch.cat(drawn, -2)
+
+
+def _spans(length: int, side: int, margin: int) -> Iterator[tuple[slice, slice]]:
+    """Of each tile along one axis: the pixels that it draws, and those that it sees."""
+    for start in range(0, length, side):
+        stop = min(start + side, length)
+        yield slice(start, stop), slice(max(start - margin, 0), min(stop + margin, length))

@@ -59,12 +59,6 @@ class StereoSettings(FusionSettings):
         default=4, ge=1, description="Neighbours that count, those that agree best: others are hidden."
     )
     radius: int = Field(default=2, ge=1, description="Radius of the compared windows, pixels.")
-    smooth_large: float = Field(
-        default=0.2,
-        ge=0,
-        description="Semi-global matching: price of a difference of several planes to a pixel beside; 0 "
-        "decides each pixel by itself.",
-    )
     confident: float = Field(
         default=0.55, ge=0, le=1, description="Least likeness, 1 - cost, of a depth that is fused."
     )
@@ -113,19 +107,10 @@ class DensitySettings(Settings):
         description="Mean gradient of the position times half the distance to the camera, above which a "
         "surfel is cloned or split.",
     )
-    clone_below: float = Field(
-        default=0.01,
-        gt=0,
-        description="Scale, relative to the scene's extent, up to which surfels are cloned; "
-        "larger ones are split.",
-    )
-    split_shrink: float = Field(default=1.6, gt=1, description="Divisor of a split surfel's scales.")
     prune_every: int = Field(default=100, ge=1, description="Steps between two prunings.")
-    prune_below: float = Field(default=0.005, ge=0, lt=1, description="Prune surfels below this opacity.")
     reset_every: int = Field(
         default=0, ge=0, description="Steps between two resets of all opacities; 0 never resets them."
     )
-    reset_to: float = Field(default=0.01, gt=0, lt=1, description="Maximum opacity after a reset.")
     most: int = Field(
         default=30_000,
         ge=4,
@@ -301,11 +286,10 @@ class FitSettings(Settings):
         "resolution or more fits each texel by itself, which gives the same irradiance and a noisy map.",
     )
     scale_steps: int = Field(default=200, ge=0, description="Updates of the scale; 0 leaves it at 1.")
-    scale_views: int = Field(
-        default=8, ge=1, description="Maximum number of photos that the scale is fitted to."
-    )
     scale_pixels: int = Field(
-        default=1 << 14, ge=1, description="Maximum number of pixels of each; larger photos are reduced."
+        default=1 << 14,
+        ge=1,
+        description="Maximum number of pixels of a photo that the scale is fitted to; larger are reduced.",
     )
     scale_rays: int = Field(
         default=16, ge=2, multiple_of=2, description="Shadow rays per pixel of these photos, even."

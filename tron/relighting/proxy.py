@@ -23,7 +23,6 @@ of their relit pictures by a proxy (five development captures), 0.7 to 0.8 of re
 from __future__ import annotations
 
 import hashlib
-import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from copy import copy
 from dataclasses import dataclass, field, replace
@@ -51,8 +50,6 @@ from tron.tracing.fusion import DepthMap, consensus, empty_rays, fuse, pixel_foo
 from tron.tracing.hierarchy.first_hit import FirstHit
 from tron.tracing.surface import Surface, centres, seen_normal
 from tron.trajectories import film_around, film_with
-
-log = logging.getLogger(__name__)
 
 Choice = Literal["auto", "always", "never"]
 

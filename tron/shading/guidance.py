@@ -163,7 +163,6 @@ def render_guidance(
     seed: int = 0,
     background: Sequence[float] | None = None,
     bounce: BouncedLight | None = None,
-    gbuffer: GBuffer | None = None,
 ) -> Guidance:
     """Trace ``camera``'s view of the surfels and shade it under ``lighting``.
 
@@ -176,10 +175,8 @@ def render_guidance(
         background: linear RGB radiance behind the surfels; None: the environment.
         bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None, or with no bounces in
             ``estimation``: no light bounces.
-        gbuffer: the view where it is traced already, of :func:`trace_views`.
     """
-    if gbuffer is None:
-        gbuffer = trace_view(tracer, camera, estimation, bounce)
+    gbuffer = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed, bounce)
     return shade(gbuffer, arriving, lighting, background, estimation)
 

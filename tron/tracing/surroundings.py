@@ -45,14 +45,13 @@ _FEWEST = 12
 _ORIGINS, _DIRECTIONS = 8, 128
 
 
-def find_surroundings(scene: GaussianScene, seed: int = 0) -> np.ndarray:
+def find_surroundings(scene: GaussianScene) -> np.ndarray:
     """(M,) bool: surfels that surround the content and shut out the light; none of them in most scenes.
 
     Costs a sort of distances; rays, 1,024 of them, only where there is a gap.
 
     Args:
         scene: the surfels, world, and which way is up.
-        seed: root of the choice of origins and directions.
     """
     none = np.zeros(len(scene), bool)
     solid = scene.opacities() > _SOLID
@@ -65,7 +64,7 @@ def find_surroundings(scene: GaussianScene, seed: int = 0) -> np.ndarray:
     if content is None:
         return none
     outer = distance > content
-    reached = _reached(scene, outer, middle, seed)
+    reached = _reached(scene, outer, middle)
     if reached is None:
         return none
     return distance > max(NEAREST * reached, content)
@@ -97,9 +96,9 @@ def _content_radius(distance: np.ndarray, size: np.ndarray) -> float | None:
     return float(CLEAR * extent[gaps[0]])
 
 
-def _reached(scene: GaussianScene, outer: np.ndarray, middle: np.ndarray, seed: int) -> float | None:
+def _reached(scene: GaussianScene, outer: np.ndarray, middle: np.ndarray) -> float | None:
     """Median distance at which rays overhead end at the outer surfels; None where too few do."""
-    rng = generator(seed, "surroundings")
+    rng = generator(0, "surroundings")
     near = np.flatnonzero(~outer & (scene.opacities() > _SOLID))
     origins = np.vstack([middle, scene.means[rng.choice(near, _ORIGINS - 1)]]).astype(np.float64)
     height = rng.uniform(np.sin(np.radians(LOWEST_DEG)), 1, (_ORIGINS, _DIRECTIONS))

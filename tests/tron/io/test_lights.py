@@ -11,8 +11,8 @@ import pytest
 from tron.apps.environment import Settings, main
 from tron.errors import TronError
 from tron.io.cube_files import open_cube
+from tron.io.image_headers import jpeg_xl_size
 from tron.io.images import encode_png, read_image, write_image
-from tron.io.jpeg_xl import jpeg_xl_size
 from tron.io.lat_long import directions
 from tron.io.lights import lat_long_of_ball, lat_long_of_cube, read_light
 from tron.shading.environments.environment import EnvironmentMap

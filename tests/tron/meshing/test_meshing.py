@@ -40,7 +40,7 @@ def ball(radius: float = RADIUS, middle: np.ndarray = MIDDLE, surfels: int = 600
         "position": middle + radius * normal, "normal": normal, "base_color": painted(normal),
         "roughness": 0.3 * some, "metallic": 0.8 * some,
     }  # fmt: skip
-    return surfels_from_points(values, 0, surfels, 4, 0.4, up=(0.0, 0.0, 1.0))
+    return surfels_from_points(values, 0, surfels)
 
 
 @pytest.mark.usefixtures("variant")

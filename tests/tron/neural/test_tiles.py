@@ -11,9 +11,8 @@ from tron import seeds
 from tron.neural.configs import PixelMLPConfig, RendererConfig, UNetConfig
 from tron.neural.networks.pixel_mlp import PixelMLP
 from tron.neural.protocols import Renderer
-from tron.neural.renderer import NeuralRenderer, render_clip
+from tron.neural.renderer import TILE, NeuralRenderer, drawn_in_tiles, render_clip
 from tron.neural.shipped import shipped
-from tron.neural.tiles import SIDE, drawn_in_tiles
 from tron.neural.weights import load_renderer
 
 
@@ -82,7 +81,7 @@ def test_clips_larger_than_a_tile_are_drawn_in_tiles(monkeypatch):
 
     monkeypatch.setattr(NeuralRenderer, "forward", watched)
     names = renderer.config.guidance
-    given = picture(names, 24, 2 * SIDE)
+    given = picture(names, 24, 2 * TILE)
     shown = {name: (image[0].permute(1, 2, 3, 0).numpy() + 1) / 2 for name, image in given.items()}
-    assert render_clip(renderer, shown).shape == (1, 24, 2 * SIDE, 3)
-    assert widest <= SIDE + 2 * 128
+    assert render_clip(renderer, shown).shape == (1, 24, 2 * TILE, 3)
+    assert widest <= TILE + 2 * 128

@@ -51,9 +51,7 @@ def test_the_papers_recipe_is_that_of_the_facts(paper: Settings) -> None:
     assert (radiance.ssim, materials.ssim, radiance.mask) == (0.2, 0.2, 0.2)
     assert radiance.background == "black"
     assert (density.start, density.end, density.every, density.threshold) == (500, 15_000, 300, 2e-4)
-    assert (density.clone_below, density.split_shrink) == (0.01, 1.6)
-    assert (density.prune_every, density.prune_below) == (100, 0.005)
-    assert (density.reset_every, density.reset_to) == (3000, 0.01)
+    assert (density.prune_every, density.reset_every) == (100, 3000)
     assert (paper.initial.kernel_degree, paper.initial.count, paper.max_side) == (2, 100_000, None)
     assert paper.light is not None
     assert (paper.light.resolution, paper.light.steps) == (512, 4000)

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import logging
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -29,8 +28,6 @@ from tron.runtime import describe_machine
 from tron.scans.camera_files import write_cameras
 from tron.storage import write_atomic
 from tron.tracing.torch_bridge import render
-
-log = logging.getLogger(__name__)
 
 CHECKPOINT = "checkpoint.safetensors"
 PAGE = "report.html"

@@ -15,7 +15,7 @@ import json
 import logging
 import os
 import shutil
-from collections.abc import Callable, Collection, Mapping, Sequence
+from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, Literal
@@ -50,8 +50,6 @@ if TYPE_CHECKING:
 
 
 log = logging.getLogger(__name__)
-
-Progress = Callable[[str], None]
 
 WORKSPACE = "structure_from_motion"
 _VERSION = 3
@@ -108,7 +106,7 @@ def _folder_of_photos(path: Path) -> Path | None:
     return next((each for each in (path / "images", path, path / INPUT) if photos_in(each)), None)
 
 
-def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.info) -> PosedPhotos:
+def pose_photos(path: Path, settings: PosingSettings) -> PosedPhotos:
     """Pose the photos of a folder; the world's scale and axes are arbitrary.
 
     The result is kept in the workspace and taken from there while photos and settings stay the same. Of
@@ -117,7 +115,6 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     Args:
         path: holds the photos, itself or in ``images`` or ``input``.
         settings: ``images`` names another folder in it.
-        progress: told in a line what begins.
 
     Raises:
         TronError: fewer than three usable photos, or none that could be posed.
@@ -149,9 +146,9 @@ def pose_photos(path: Path, settings: PosingSettings, progress: Progress = log.i
     refuse_discs(photos, lambda path: opened[path]())
     panoramas = equirectangular(photos, lambda path: opened[path]())
     if panoramas:
-        progress(f"{len(panoramas)} of {len(photos)} photos show 360 degrees")
+        log.info("%d of %d photos show 360 degrees", len(panoramas), len(photos))
     with locked(workspace):
-        copies = _posed_copies(photos, panoramas, masks, workspace, settings, progress)
+        copies = _posed_copies(photos, panoramas, masks, workspace, settings)
         model = read_model(workspace / "sparse")
     by_name = {path.name: path for path in photos}
     posed = []
@@ -169,7 +166,6 @@ def _posed_copies(
     masks: Mapping[Path, Path],
     workspace: Path,
     settings: PosingSettings,
-    progress: Progress,
 ) -> dict[str, str]:
     """Names of photos by those of their posed copies; makes the model unless it is kept."""
     record = workspace / "photos.json"
@@ -185,15 +181,15 @@ def _posed_copies(
     }
     kept = _kept(record)
     if kept.get("wanted") == wanted and (workspace / "sparse").is_dir():
-        progress(f"poses of {len(photos)} photos taken from {workspace}")
+        log.info("poses of %d photos taken from %s", len(photos), workspace)
         return kept["copies"]
     record.unlink(missing_ok=True)
     _clear(workspace, "images", "masks", "models", "sparse")
-    progress(f"copying {len(photos)} photos for feature extraction")
+    log.info("copying %d photos for feature extraction", len(photos))
     copies = _copy(photos, workspace / "images", settings.feature_side, settings.exr_exposure, panoramas)
     if masks:
         _copy_masks({copies[name]: name for name in copies}, masks, workspace)
-    _map(workspace, len(photos), settings, progress)
+    _map(workspace, len(photos), settings)
     write_atomic(record, json.dumps({"wanted": wanted, "copies": copies}, indent=1))
     _clear(workspace, "images", "masks", "models")
     return copies
@@ -274,7 +270,7 @@ def _eight_bits(picture: Image.Image) -> Image.Image:
     return picture.convert("RGB")
 
 
-def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progress) -> None:
+def _map(workspace: Path, count: int, settings: PosingSettings) -> None:
     """Make ``workspace/sparse`` of ``workspace/images``: the largest model."""
     pycolmap = load_pycolmap()
     pycolmap.set_random_seed(settings.seed)
@@ -291,7 +287,7 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
     verification = pycolmap.TwoViewGeometryOptions()
     verification.ransac.random_seed = settings.seed
     try:
-        progress(f"extracting features of {count} photos")
+        log.info("extracting features of %d photos", count)
         names = sorted(each.relative_to(images).as_posix() for each in images.rglob("*.jpg"))
         for reader.camera_model, whole in (("OPENCV", False), ("EQUIRECTANGULAR", True)):
             if not (some := [name for name in names if name.startswith(_PANORAMA) == whole]):
@@ -311,18 +307,18 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
             "device": pycolmap.Device.cpu,
         }
         if settings.matching == "sequential":
-            progress("matching features of neighbours in time")
+            log.info("matching features of neighbours in time")
             pycolmap.match_sequential(database, **options)
         elif settings.matching == "exhaustive":
-            progress("matching features of every pair")
+            log.info("matching features of every pair")
             pycolmap.match_exhaustive(database, **options)
         else:
             pairs = _write_pairs(database, workspace / "pairs.txt")
-            progress(f"matching features of {pairs} pairs out of {count * (count - 1) // 2}")
+            log.info("matching features of %d pairs out of %d", pairs, count * (count - 1) // 2)
             pairing = pycolmap.ImportedPairingOptions()
             pairing.match_list_path = workspace / "pairs.txt"
             pycolmap.match_image_pairs(database, pairing_options=pairing, **options)
-        progress("finding cameras and points")
+        log.info("finding cameras and points")
         models = pycolmap.incremental_mapping(
             database, images, workspace / "models", options=_mapping_options(count, threads, settings.seed)
         )
@@ -335,7 +331,8 @@ def _map(workspace: Path, count: int, settings: PosingSettings, progress: Progre
             "take more photos that overlap by half or more, from different places, of a textured scene",
         )
     largest = max(models.values(), key=lambda model: (model.num_reg_images(), model.num_points3D()))
-    progress(f"{largest.num_reg_images()} of {count} photos posed, {largest.num_points3D()} points")
+    posed, points = largest.num_reg_images(), largest.num_points3D()
+    log.info("%d of %d photos posed, %d points", posed, count, points)
     (workspace / "sparse").mkdir()
     largest.write_binary(workspace / "sparse")
 

@@ -16,6 +16,7 @@ from tron.neural.clips import TEMPORAL_FACTOR as TIME
 from tron.neural.clips import check_frames
 
 SPACE, COLORS = 4, 3
+_SMALLEST_DEVIATION = 0.02  # of a channel: quieter ones would be blown up
 
 
 def dct_matrix(n: int) -> Tensor:
@@ -42,14 +43,13 @@ class BlockDCT(nn.Module):
     mean: Tensor
     deviation: Tensor
 
-    def __init__(self, smallest_deviation: float = 0.02):
+    def __init__(self) -> None:
         super().__init__()
         space = dct_matrix(SPACE)
         basis = torch.kron(dct_matrix(TIME), torch.kron(space, space))  # (64, 64), orthonormal
         self.register_buffer("basis", basis.float(), persistent=False)
         self.register_buffer("mean", torch.zeros(self.latent_channels))
         self.register_buffer("deviation", torch.ones(self.latent_channels))
-        self.smallest_deviation = smallest_deviation
 
     def encode(self, video: Tensor) -> Tensor:
         """(B, 3, 1 + 4n, H, W) display values in [-1, 1] -> latents (B, 192, 1 + n, H / 4, W / 4).
@@ -94,4 +94,4 @@ class BlockDCT(nn.Module):
         variance = (squares / count - mean.square()).clamp_min(0)
         self.mean.copy_(mean)
         # One frame alone has no temporal frequencies: their deviation of zero must not be divided by.
-        self.deviation.copy_(variance.sqrt().clamp_min(self.smallest_deviation))
+        self.deviation.copy_(variance.sqrt().clamp_min(_SMALLEST_DEVIATION))

@@ -35,7 +35,6 @@ _SAME_PLACE = 1e-9  # rounding moves cameras that turn on the spot by about 1e-1
 _ABOUT = 0.99  # surfels from depth maps are as many as asked for within half a percent
 _SOME = 10_000  # points that tell how far away they all are
 _DENSE = 2.0  # pixels between points that cover surfaces; structure from motion's lie farther apart
-_SCALES = {2: 0.6, 4: 0.4}
 _FEWEST = 0.05  # share of pixels with a confirmed depth below which stereo has found nothing but chance
 _SUBJECT = 0.5
 # A few pixels a surfel say all that surfels of that size can hold.
@@ -234,7 +233,6 @@ def surfels_from_depth(capture: Capture, settings: InitialSettings, seed: int) -
         samples,
         count=settings.count,
         kernel_degree=settings.kernel_degree,
-        scale=_SCALES[settings.kernel_degree],
         up=capture.up.tolist(),
     )
 

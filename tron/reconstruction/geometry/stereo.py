@@ -45,7 +45,7 @@ _FEWEST_POINTS = 100
 _MOST_POINTS = 50_000
 _MOST_PIXELS = 1 << 25  # of all photographs together: some 60 bytes each
 _MOST_THREADS = 4  # each holds its photograph's costs on all planes some ten times
-_SMOOTH_SMALL = 0.02  # price of one plane's difference to a pixel beside: a tenth of larger ones'
+_SMOOTH_SMALL, _SMOOTH_LARGE = 0.02, 0.2  # prices of one plane's difference to a pixel beside, and of several
 _OUTLIERS = (0.5, 99.5)
 _MARGIN = (0.95, 1.05)
 _FEWEST_SHOWN = 20
@@ -216,10 +216,7 @@ def swept(
     cost = window_mean(cost, 1)
     if seeded:
         cost = _favoured(cost, photograph, points, inverse)
-    if settings.smooth_large > 0:
-        smooth = semi_global_cost(cost, photograph.grey, _SMOOTH_SMALL, settings.smooth_large)
-    else:
-        smooth = cost
+    smooth = semi_global_cost(cost, photograph.grey, _SMOOTH_SMALL, _SMOOTH_LARGE)
     place, _ = refined_minimum(smooth)
     step = float(inverse[1] - inverse[0])
     depth = 1 / (inverse[0] + place * step) / photograph.along

@@ -37,6 +37,9 @@ from tron.tracing.torch_bridge import render
 Background = Literal["black", "white", "random"]
 _PSNR_MEMORY = 0.98
 _EXPOSURES_FROM = 0.1
+# Of "3D Gaussian Splatting" (Kerbl et al. 2023): scale over the extent up to which surfels are cloned, larger
+# ones are split; divisor of split ones' scales; opacity that others are pruned below; opacity after a reset.
+_CLONE_BELOW, _SPLIT_SHRINK, _PRUNE_BELOW, _RESET_TO = 0.01, 1.6, 0.005, 0.01
 # Of views, kept on a GPU, and no more than a quarter of what is free: what is read, checked and reduced for
 # each step on the host leaves it idle.
 _KEPT_ON_DEVICE = 8 << 30
@@ -387,11 +390,11 @@ class DensityControl:
         if step % s.prune_every == 0 and step < s.end:
             self._prune(surfels)
         if s.reset_every and step < s.end and step % s.reset_every == 0:
-            most = torch.logit(torch.tensor(s.reset_to, device=surfels.device))
+            most = torch.logit(torch.tensor(_RESET_TO, device=surfels.device))
             surfels.replace("opacity_logits", surfels["opacity_logits"].detach().clamp(max=most))
 
     def _prune(self, surfels: LearntSurfels) -> None:
-        kept = torch.sigmoid(surfels["opacity_logits"].detach()) >= self.settings.prune_below
+        kept = torch.sigmoid(surfels["opacity_logits"].detach()) >= _PRUNE_BELOW
         if kept.all():
             return
         surfels.select(kept)
@@ -407,7 +410,7 @@ class DensityControl:
             chosen = chosen[torch.topk(pull[chosen], capacity, sorted=False).indices].sort().values
         if len(chosen):
             scale = surfels["log_scales"].detach()[chosen].exp().amax(dim=1)
-            small = scale <= s.clone_below * self.extent
+            small = scale <= _CLONE_BELOW * self.extent
             clones = {name: values.detach()[chosen[small]] for name, values in surfels.tensors.items()}
             halves = self._halves(surfels, chosen[~small], step)
             kept = torch.ones(len(surfels), dtype=torch.bool, device=surfels.device)
@@ -428,7 +431,7 @@ class DensityControl:
         place = torch.tensor(draw, dtype=torch.float32, device=surfels.device) * rows["log_scales"].exp()
         tangent_u, tangent_v = _tangents(rows["quats"])
         rows["means"] = rows["means"] + place[:, :1] * tangent_u + place[:, 1:] * tangent_v
-        rows["log_scales"] = rows["log_scales"] - torch.log(torch.tensor(self.settings.split_shrink))
+        rows["log_scales"] = rows["log_scales"] - torch.log(torch.tensor(_SPLIT_SHRINK))
         return rows
 
     def state(self) -> dict[str, Tensor]:

@@ -38,6 +38,7 @@ DARKEST = 1e-4
 """The first light is at least this bright, relative to its brightest channel: a logarithm needs light."""
 RATE_POWER = 1.0
 """Learning rates fall with a level's resolution to this power; at 0.5 single texels still show as noise."""
+_PHOTOS = 8  # at most, that the scale is fitted to
 LEARNING_RATE = 0.1
 """Adam's first rate, in log sigma: it falls to a hundredth, so 200 steps reach factors of exp(4.3) = 70."""
 
@@ -282,7 +283,7 @@ def choose_photos(views: Sequence[View], settings: FitSettings, exposure: float)
     Linear images are exposed and tone-mapped by AgX, display images are taken as they are.
     """
     draw = generator(settings.seed, "environment", "photos")
-    chosen = np.sort(draw.permutation(len(views))[: settings.scale_views])
+    chosen = np.sort(draw.permutation(len(views))[:_PHOTOS])
     photos = []
     for view in (views[i] for i in chosen):
         factor = max(1, int(np.ceil(np.sqrt(view.camera.width * view.camera.height / settings.scale_pixels))))

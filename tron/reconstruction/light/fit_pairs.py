@@ -16,10 +16,10 @@ Pairs are near in space, or near in the chromaticity of the *current* rho; w fal
 chromaticity, and with how many points face the same way. They are drawn anew after each round. Base color is
 never a variable, so there is nothing to alternate.
 
-log L is a sum of cubemaps of 1, 2, 4, ... texels a face edge, luminance and two chromas apart. Priors, each a
-setting: the 95th percentile of base color is ``brightest``, as few surfaces reflect more (``scale``; what
-bounces says it too, but weakly); fine levels are small (``smooth``), colours grey (``grey``), directions that
-no point looks into dark (``dark``, ``darkness``), and those that photos show are as they show them (``sky``).
+log L is a sum of cubemaps of 1, 2, 4, ... texels a face edge, luminance and two chromas apart. Priors, each
+with its weight: the 95th percentile of base color is ``brightest``, as few surfaces reflect more (what
+bounces says it too, but weakly); fine levels are small, colours grey, directions that no point looks into
+dark, and those that photos show are as they show them.
 """
 
 from __future__ import annotations
@@ -41,8 +41,20 @@ from tron.reconstruction.settings import Settings
 from tron.runtime import torch_device
 from tron.seeds import generator
 
-_NEAR, _ALIKE = 60, 200
+_NEARBY, _SIMILAR = 60, 200
 """Neighbours in space and in chromaticity that partners are drawn from."""
+_PARTNERS = 8  # of each point, of either kind
+_RATE = 0.05  # of Adam, in log radiance
+PATCH = 3.5
+"""Radius of the patches that are compared, in spacings of surfels."""
+ROBUST = 0.2
+"""Log difference beyond which a pair is doubted."""
+ALIKE = 0.12
+"""Log chromaticity that like materials differ by."""
+_SCALE, _SMOOTH, _GREY, _DARK, _SKY = 0.05, 3e-3, 0.05, 0.02, 0.5
+"""Weights of the priors: brightness of base color, small fine levels, grey light, dark unseen directions, and
+the sky as the photos show it."""
+_DARKNESS = 0.3  # radiance of unseen directions, as a share of the mean
 _PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
 _MOST = 40  # points of a patch
@@ -61,27 +73,11 @@ class LightSettings(Settings):
 
     resolution: int = Field(default=8, ge=2, le=32, description="Texels along a face edge of the cubemap.")
     points: int = Field(default=5000, ge=100, description="Maximum number of surfels that are compared.")
-    partners: int = Field(default=8, ge=1, description="Partners of each point, of either kind.")
     rounds: int = Field(default=2, ge=1, description="Times that the pairs are drawn.")
     steps: int = Field(default=150, ge=1, description="Steps of Adam a round.")
-    rate: float = Field(default=0.05, gt=0, description="Learning rate, in log radiance.")
-    patch: float = Field(
-        default=3.5, ge=0,
-        description="Radius of the patches that are compared, in spacings of surfels; 0 compares surfels.",
-    )  # fmt: skip
-    robust: float = Field(default=0.2, gt=0, description="Log difference beyond which a pair is doubted.")
-    alike: float = Field(default=0.12, gt=0, description="Log chromaticity that like materials differ by.")
     brightest: float = Field(
         default=0.8, gt=0, le=1, description="Base color of the 95th percentile, largest channel."
     )
-    scale: float = Field(default=0.05, ge=0, description="Weight of base color being as bright as that.")
-    smooth: float = Field(default=3e-3, ge=0, description="Weight of fine levels being small.")
-    grey: float = Field(default=0.05, ge=0, description="Weight of the light being grey.")
-    dark: float = Field(default=0.02, ge=0, description="Weight of unseen directions being dark.")
-    darkness: float = Field(
-        default=0.3, gt=0, le=1, description="Radiance of unseen directions, as a share of the mean."
-    )
-    sky: float = Field(default=0.5, ge=0, description="Weight of the sky being as the photos show it.")
 
 
 @dataclass(frozen=True)
@@ -108,9 +104,9 @@ class Points:
         arrays = {name: value if value is None else value[which] for name, value in vars(self).items()}
         return Points(**arrays)
 
-    def patches(self, radius: float, alike: float) -> Patches:
-        """Patches of the points; ``radius`` in world units, ``alike`` in log chromaticity."""
-        return Patches.of(self.position, self.normal, np.maximum(self.color, FLOOR), radius, alike)
+    def patches(self, radius: float) -> Patches:
+        """Patches of the points; ``radius`` in world units."""
+        return Patches.of(self.position, self.normal, np.maximum(self.color, FLOOR), radius)
 
     def averaged(self, patches: Patches) -> Points:
         """Points of what patches show and see, means over each; of colours the geometric one."""
@@ -152,7 +148,7 @@ def fit_light(
 
     Args:
         points: at least ten, all of them seen.
-        settings: weights, rates, sizes.
+        settings: sizes and steps.
         seed: root of the pairs.
         sky: radiance of the cubemap's directions as the photos show it; None: they show none.
         begin: light whose sun to begin with.
@@ -207,13 +203,13 @@ class _Fit:
         )
         self.sun = tensor(np.log(np.maximum(first, 1e-6))).requires_grad_(True)
         groups = [
-            {"params": [*self.grey, self.sun], "lr": settings.rate},
-            {"params": self.chroma, "lr": 0.4 * settings.rate},
+            {"params": [*self.grey, self.sun], "lr": _RATE},
+            {"params": self.chroma, "lr": 0.4 * _RATE},
         ]
         self.adam = torch.optim.Adam(groups)
         size = np.ptp(points.position, axis=0).max()
         place = np.concatenate([points.position / size, _TURN * points.normal], 1)
-        self.near = np.asarray(KDTree(place).query(place, k=min(_NEAR, len(place)))[1])
+        self.near = np.asarray(KDTree(place).query(place, k=min(_NEARBY, len(place)))[1])
         facing = KDTree(points.normal).query_ball_point(points.normal, 0.3, return_length=True)
         self.rare = 1 / np.sqrt(facing)
         # How much of the points' light could come from a direction, against an open sphere of points: 1/4.
@@ -239,46 +235,45 @@ class _Fit:
 
     def draw_pairs(self, number: int) -> None:
         """Draw partners of all points by the current base color."""
-        settings, draw = self.settings, generator(self.seed, "joint light", "pairs", number)
+        draw = generator(self.seed, "joint light", "pairs", number)
         with torch.no_grad():
             base = self.log_base_color().cpu().numpy()
         chroma = base[:, [0, 2]] - base[:, 1:2]
         count = len(base)
-        alike = np.asarray(KDTree(chroma).query(chroma, k=min(_ALIKE, count))[1])
-        i = np.repeat(np.arange(count), settings.partners)
+        alike = np.asarray(KDTree(chroma).query(chroma, k=min(_SIMILAR, count))[1])
+        i = np.repeat(np.arange(count), _PARTNERS)
         partners = [table[i, draw.integers(1, table.shape[1], len(i))] for table in (self.near, alike)]
         i, j = np.tile(i, 2), np.concatenate(partners)
         weight = np.repeat([1.0, 0.5], len(i) // 2) * (self.rare[i] + self.rare[j])
-        weight *= np.exp(-(((chroma[i] - chroma[j]) / settings.alike) ** 2).sum(1))
+        weight *= np.exp(-(((chroma[i] - chroma[j]) / ALIKE) ** 2).sum(1))
         # By point: the first of a pair then needs no gather, whose adjoint is the slowest part of a step.
-        shape = (2, count, settings.partners)
+        shape = (2, count, _PARTNERS)
         j, weight = (np.moveaxis(values.reshape(shape), 0, 1).reshape(count, -1) for values in (j, weight))
         self.partner = torch.from_numpy(j.ravel()).to(self.log_color.device)
         self.weight = self.tensor(weight / weight.sum())[..., None] / 3
 
     def step(self) -> None:
         """Take one step of Adam."""
-        settings = self.settings
         light, base = self.log_light(), self.log_base_color()
         off = (base[:, None] - base.index_select(0, self.partner).view(*self.weight.shape[:2], 3)).abs()
-        loss = (self.weight * settings.robust * torch.log1p(off / settings.robust)).sum()
-        loss = loss + settings.smooth * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
-        loss = loss + settings.grey * sum(_coloured(z) for z in self.chroma[1:])
-        loss = loss + settings.grey * 0.05 * _coloured(self.chroma[0])
+        loss = (self.weight * ROBUST * torch.log1p(off / ROBUST)).sum()
+        loss = loss + _SMOOTH * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
+        loss = loss + _GREY * sum(_coloured(z) for z in self.chroma[1:])
+        loss = loss + _GREY * 0.05 * _coloured(self.chroma[0])
         bright = torch.quantile(base.amax(1), _PERCENTILE / 100)
-        loss = loss + settings.scale * (bright - float(np.log(settings.brightest))) ** 2
+        loss = loss + _SCALE * (bright - float(np.log(self.settings.brightest))) ** 2
         brightness = light.mean(1)
         mean = torch.log(torch.exp(brightness).mean()).detach()
-        above = (brightness - mean - float(np.log(settings.darkness))) ** 2
-        loss = loss + settings.dark * (self.unseen * above).mean()
+        above = (brightness - mean - float(np.log(_DARKNESS))) ** 2
+        loss = loss + _DARK * (self.unseen * above).mean()
         if self.sky is not None:
             shown, trust = self.sky
-            loss = loss + settings.sky * (trust[:, None] * torch.log1p((light - shown).abs())).mean()
+            loss = loss + _SKY * (trust[:, None] * torch.log1p((light - shown).abs())).mean()
         self.adam.zero_grad()
         loss.backward()
         self.loss = float(loss.detach())
         if not np.isfinite(self.loss):
-            raise TronError(f"the loss of the light is {self.loss}", mend="lower prior.light.rate")
+            raise TronError(f"the loss of the light is {self.loss}")
         self.adam.step()
 
     def result(self) -> Light:
@@ -325,16 +320,13 @@ class Patches:
     weights: csr_array
 
     @classmethod
-    def of(
-        cls, position: np.ndarray, normal: np.ndarray, color: np.ndarray, radius: float, alike: float
-    ) -> Patches:
+    def of(cls, position: np.ndarray, normal: np.ndarray, color: np.ndarray, radius: float) -> Patches:
         """Patches by place, facing and chromaticity, each weighted smoothly.
 
         Args:
             position, normal: (P, 3) world, normals unit.
             color: (P, 3) linear, positive.
             radius: standard deviation in space, world units; 0 leaves each point alone.
-            alike: log chromaticity that points of a patch differ by.
         """
         count = len(position)
         if radius <= 0 or count < 2:
@@ -345,7 +337,7 @@ class Patches:
         chroma = log[:, [0, 2]] - log[:, 1:2]
         facing = np.einsum("pkc,pc->pk", normal[near], normal)
         weight = np.exp(-0.5 * (distance / radius) ** 2) * np.clip((facing - _FACING) / (1 - _FACING), 0, 1)
-        weight *= np.exp(-((chroma[near] - chroma[:, None]) ** 2).sum(-1) / alike**2)
+        weight *= np.exp(-((chroma[near] - chroma[:, None]) ** 2).sum(-1) / ALIKE**2)
         weight /= weight.sum(1, keepdims=True)  # each point is its own nearest, and weighs 1
         rows = np.repeat(np.arange(count), near.shape[1])
         entries = (weight.ravel().astype(np.float32), (rows, near.ravel()))

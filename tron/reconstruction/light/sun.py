@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import KDTree
 
 from tron.framing import even_directions
-from tron.reconstruction.light.fit_pairs import Light, Points
+from tron.reconstruction.light.fit_pairs import ALIKE, ROBUST, Light, Points
 from tron.reconstruction.light.sky_visibility import visibility_towards
 from tron.seeds import generator
 from tron.shading.direct.irradiance import Occluder
@@ -67,24 +67,13 @@ class SunSearch:
         points: the surface.
         soft: light without a sun.
         radius: of the patches that are compared, world units.
-        robust, alike: as of :class:`tron.reconstruction.light.fit_pairs.LightSettings`.
         seed: root of the pairs.
     """
 
-    def __init__(
-        self,
-        tracer: Occluder,
-        points: Points,
-        soft: Light,
-        radius: float,
-        robust: float,
-        alike: float,
-        seed: int,
-    ) -> None:
+    def __init__(self, tracer: Occluder, points: Points, soft: Light, radius: float, seed: int) -> None:
         self.tracer, self.points, self.soft = tracer, points, soft
-        self.settings = (radius, robust, alike, seed)
-        self.robust = robust
-        self.patches = points.patches(radius, alike)
+        self.radius, self.seed = radius, seed
+        self.patches = points.patches(radius)
         averaged = points.averaged(self.patches)
         # The soft light has put what it could of the sun into its brightest texels: that is not the rest.
         grey = soft.texels.mean(1)
@@ -100,7 +89,7 @@ class SunSearch:
         self.first = np.repeat(np.arange(len(near)), _NEIGHBOURS)
         self.second = np.take_along_axis(near, chosen, 1).ravel()
         # Shadows are bluer than the sun's light: chromaticity may differ by more than within a material.
-        gap = ((chroma[self.first] - chroma[self.second]) / (2 * alike)) ** 2
+        gap = ((chroma[self.first] - chroma[self.second]) / (2 * ALIKE)) ** 2
         self.weight = np.exp(-gap.sum(1))
         self.weight /= self.weight.sum()
         brightness = shown.mean(1)
@@ -123,7 +112,7 @@ class SunSearch:
         """The same search among some of the points."""
         stride = -(-len(self.points.position) // _FEW)
         few = self.points.taken(slice(None, None, stride))
-        return SunSearch(self.tracer, few, self.soft, *self.settings)
+        return SunSearch(self.tracer, few, self.soft, self.radius, self.seed)
 
     def width(self, direction: np.ndarray, strength: float) -> tuple[float, float]:
         """The width, of ``WIDTHS``, and the strength near another, whose shadows fit best together.
@@ -159,7 +148,7 @@ class SunSearch:
 
     def _loss(self, log_received: np.ndarray) -> float:
         off = np.abs(self.shown - log_received[self.first] + log_received[self.second])
-        return float((self.weight * np.log1p(off / self.robust)).sum())
+        return float((self.weight * np.log1p(off / ROBUST)).sum())
 
 
 def lobe_transport(

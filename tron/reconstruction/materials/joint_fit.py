@@ -17,7 +17,7 @@ from tron.captures.view import ToneCurve
 from tron.color import MIDDLE_GREY, luminance
 from tron.estimation import Estimation
 from tron.gaussians import GaussianScene
-from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, TooFewSeen, fit_light
+from tron.reconstruction.light.fit_pairs import PATCH, Light, LightSettings, Points, TooFewSeen, fit_light
 from tron.reconstruction.light.sky_visibility import PhotographedSky, photographed_sky, sky_transport
 from tron.reconstruction.light.sun import Sun, SunSearch
 from tron.reconstruction.light.surfel_colors import SurfelColors, mean_colors, observe
@@ -277,12 +277,12 @@ class LightFinder:
             self.bounced[kept],
             self.transport[kept],
         )
-        radius = settings.patch * self.tracer.scene.spacing
-        points = surfels.averaged(surfels.patches(radius, settings.alike))
+        radius = PATCH * self.tracer.scene.spacing
+        points = surfels.averaged(surfels.patches(radius))
         soft = fit_light(points, settings, seed, self.sky)
         if self.prior.sun >= 1:
             return soft, None
-        search = SunSearch(self.tracer, surfels, soft, radius, settings.robust, settings.alike, seed)
+        search = SunSearch(self.tracer, surfels, soft, radius, seed)
         direction, strength = search.find()
         width, strength = search.width(direction, strength)
         lit = replace(points, lobe=search.received(direction, width))

@@ -194,7 +194,7 @@ class BounceTransport:
             root = integer(seed, "bounce", "direct", part.first)
             return visibility(self.tracer, part.gbuffer, lighting, estimation, root)
 
-        return mi.Color3f(*_of_parts(parts(self.tracer), len(self.tracer.scene), 3, of))
+        return mi.Color3f(*_of_parts(parts(self.tracer), len(self.tracer.scene), of))
 
     def indirect(
         self, direct: mi.Color3f | Sequence[mi.Color3f], albedo: mi.Color3f, bounces: int = FINAL.bounces
@@ -294,7 +294,7 @@ class BounceTransport:
             root = integer(seed, "bounce", "direct", part.first)
             return [*visibility(self.tracer, part.gbuffer, lighting, estimation, root)]
 
-        found = _of_parts(parts(self.tracer), len(self.tracer.scene), 3, of)
+        found = _of_parts(parts(self.tracer), len(self.tracer.scene), of)
         return self._lending.lent(found) if lent else found
 
     @cached_property
@@ -333,14 +333,12 @@ def _visible_behind(behind: Undersides, lighting: Lighting, estimation: Estimati
         root = integer(seed, "bounce", "direct", "undersides", part.first)
         return visibility(behind.tracer, part.gbuffer, lighting, estimation, root)
 
-    return mi.Color3f(*_of_parts(behind.parts(), dr.width(behind.surfel), 3, of))
+    return mi.Color3f(*_of_parts(behind.parts(), dr.width(behind.surfel), of))
 
 
-def _of_parts(
-    every: Iterable[Part], count: int, values: int, of: Callable[[Part], Iterable[mi.Float]]
-) -> list[mi.Float]:
-    """``values`` numbers of each of ``count`` faces, found part after part."""
-    found = [dr.zeros(mi.Float, count) for _ in range(values)]
+def _of_parts(every: Iterable[Part], count: int, of: Callable[[Part], Iterable[mi.Float]]) -> list[mi.Float]:
+    """Three numbers of each of ``count`` faces, found part after part."""
+    found = [dr.zeros(mi.Float, count) for _ in range(3)]
     for part in every:
         for target, value in zip(found, of(part), strict=True):
             dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)

@@ -135,12 +135,6 @@ class SurfelRays:
             other._trace_again(self.met, changed)
         return other
 
-    def meeting(self, met: mi.UInt32) -> SurfelRays:
-        """The same rays, said to meet something else: ``met`` of any number of surfels."""
-        other = copy(self)
-        other.met = met
-        return other
-
     def of_some(self, tracer: SurfelTracer, surfel: mi.UInt32) -> mi.UInt32:
         """Codes, as ``met``, of what stops the rays of some surfels (B,) in ``tracer``: (rays x B)."""
         other, some = copy(self), dr.opaque(mi.UInt32, dr.width(surfel))

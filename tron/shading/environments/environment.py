@@ -34,6 +34,8 @@ PDF_WIDTH = 512
 PDF_FLOOR = 0.01
 """Least density of a cell, relative to the mean: no direction is impossible, so lookups stay unbiased."""
 
+_ROWS = 64  # of the map that a plane's light is summed over: more are slower, fewer blur what grazes it
+
 
 @dataclass(frozen=True, eq=False)
 class EnvironmentMap:
@@ -165,14 +167,13 @@ class EnvironmentMap:
         weights *= 2 / self.image.shape[1]
         return np.einsum("i,ijc->c", weights, self.image, dtype=np.float64)
 
-    def unoccluded(self, normal: np.ndarray, rows: int = 64) -> np.ndarray:
+    def unoccluded(self, normal: np.ndarray) -> np.ndarray:
         """(3,) float64: radiance of a white diffuse plane with nothing in the way, E / pi.
 
         Args:
             normal: (3,) unit, world.
-            rows: of the map that is summed; fewer are quicker, and blur what light grazes the plane.
         """
-        light = self.baked().resized(min(rows, self.image.shape[0]))
+        light = self.baked().resized(min(_ROWS, self.image.shape[0]))
         facing = np.maximum(light.directions() @ np.asarray(normal, np.float64), 0) / np.pi
         return np.einsum("i,ij,ijc->c", light.solid_angles(), facing, light.image, dtype=np.float64)
 

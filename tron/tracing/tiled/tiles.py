@@ -43,15 +43,12 @@ class TileLists:
     Attributes:
         start, count: mi.UInt32, one entry a tile (row-major): where its list lies in ``entries``.
         entries: mi.UInt32, surfel ids. near: mi.Float, lower bounds of t for the tile's rays; ascending.
-        tiles_x, tiles_y: tiles across and down; the last ones may hang over the image's edge.
     """
 
     start: mi.UInt32
     count: mi.UInt32
     entries: mi.UInt32
     near: mi.Float
-    tiles_x: int
-    tiles_y: int
 
 
 def tile_counts(width: int, height: int) -> tuple[int, int]:
@@ -127,7 +124,7 @@ def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 
             mend="render the image in parts, or without surfels as large as the view",
         )
     if total == 0:
-        return _no_lists(tiles_x, tiles_y)
+        return _no_lists(tiles_x * tiles_y)
 
     # Each surfel marks its first entry; a running maximum gives every entry its surfel.
     surfel = dr.zeros(mi.UInt32, total)
@@ -144,7 +141,7 @@ def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 
     dr.eval(tile, surfel, meets, near)
     kept = dr.compress(meets)
     if dr.width(kept) == 0:
-        return _no_lists(tiles_x, tiles_y)
+        return _no_lists(tiles_x * tiles_y)
     tile, surfel = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, surfel, kept)
     # One sort orders tiles and, within each, bounds, which take what bits of a key the tiles leave.
     levels = min((1 << 32) // (tiles_x * tiles_y), 1 << 31)
@@ -157,12 +154,12 @@ def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 
     start, count = _runs(key // levels, tiles_x * tiles_y)
     entries, near = dr.gather(mi.UInt32, surfel, position), scale.near(key % levels)
     dr.eval(start, count, entries, near)
-    return TileLists(start, count, entries, near, tiles_x, tiles_y)
+    return TileLists(start, count, entries, near)
 
 
-def _no_lists(tiles_x: int, tiles_y: int) -> TileLists:
-    empty = dr.zeros(mi.UInt32, tiles_x * tiles_y)
-    return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1), tiles_x, tiles_y)
+def _no_lists(tiles: int) -> TileLists:
+    empty = dr.zeros(mi.UInt32, tiles)
+    return TileLists(empty, empty, dr.zeros(mi.UInt32, 1), dr.zeros(mi.Float, 1))
 
 
 def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:

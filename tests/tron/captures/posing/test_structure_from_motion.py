@@ -32,7 +32,9 @@ def aligned(points: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 @pytest.mark.long
-def test_the_fox_is_posed_as_its_file_says(fox: Path, tmp_path: Path) -> None:
+def test_the_fox_is_posed_as_its_file_says(
+    fox: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
     truth = load_capture(fox, LoadSettings(downscale=8))
     folder = tmp_path / "photos"
     folder.mkdir()
@@ -44,7 +46,6 @@ def test_the_fox_is_posed_as_its_file_says(fox: Path, tmp_path: Path) -> None:
             exif = Image.Exif()
             exif[0x0112] = 6
             picture.transpose(Image.Transpose.ROTATE_90).save(folder / path.name, quality=95, exif=exif)
-    said: list[str] = []
     settings = LoadSettings(downscale=8, feature_side=800, threads=1)
     capture = load_capture(folder, settings)
     assert len(capture.views) >= COUNT - 1
@@ -67,9 +68,12 @@ def test_the_fox_is_posed_as_its_file_says(fox: Path, tmp_path: Path) -> None:
     # What was posed is kept: a second load neither repeats it nor differs.
     from tron.captures.posing.structure_from_motion import pose_photos
 
-    posed = pose_photos(folder, settings, said.append)
-    assert len(said) == 1
-    assert "taken from" in said[0]
+    caplog.clear()
+    with caplog.at_level("INFO", "tron.captures.posing"):
+        posed = pose_photos(folder, settings)
+    assert [each.getMessage() for each in caplog.records] == [
+        f"poses of {COUNT} photos taken from {folder / 'structure_from_motion'}"
+    ]
     assert posed.points is not None
     assert np.array_equal(posed.points.astype(np.float32), capture.points)
 

@@ -71,7 +71,7 @@ def test_the_criterion_is_the_gradient_times_half_the_distance() -> None:
 
 
 def test_small_ones_are_cloned_and_large_ones_split() -> None:
-    surfels, density = surfels_of(4, scale=0.01 * EXTENT), control(clone_below=0.01)
+    surfels, density = surfels_of(4, scale=0.01 * EXTENT), control()
     with torch.no_grad():  # surfels 1 and 2 are just too large; 3 is not pulled
         surfels["log_scales"][1:3] += 0.01
     before = {name: array(surfels, name) for name in ROWS}
@@ -145,7 +145,7 @@ def test_the_mean_begins_anew_after_an_addition() -> None:
 
 
 def test_the_transparent_go_and_the_means_of_the_others_stay() -> None:
-    surfels, density = surfels_of(4), control(every=1000, prune_below=0.005)
+    surfels, density = surfels_of(4), control(every=1000)
     logit = float(torch.logit(torch.tensor(0.005)))
     with torch.no_grad():
         surfels["opacity_logits"][1] = logit - 0.01
@@ -158,7 +158,7 @@ def test_the_transparent_go_and_the_means_of_the_others_stay() -> None:
 
 
 def test_a_reset_lowers_the_opaque_alone_and_forgets_their_momentum() -> None:
-    surfels, density = surfels_of(3), control(every=1000, prune_every=1000, reset_every=5, reset_to=0.01)
+    surfels, density = surfels_of(3), control(every=1000, prune_every=1000, reset_every=5)
     with torch.no_grad():
         surfels["opacity_logits"][0] = -5.0  # 0.0067: below the reset already
     surfels["means"].grad = torch.ones(3, 3)

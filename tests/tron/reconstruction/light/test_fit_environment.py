@@ -20,7 +20,7 @@ from tron.seeds import generator
 from tron.shading import EnvironmentMap, Lighting, render_guidance
 
 QUICK = FitSettings(resolution=16, steps=250, rays=16, pixels=512, scale_steps=100, split_sum_resolution=64)
-SCALE = FitSettings(scale_views=6, scale_pixels=10**6, scale_steps=150, scale_rays=32)
+SCALE = FitSettings(scale_pixels=10**6, scale_steps=150, scale_rays=32)
 
 
 def cosine_integral(light: EnvironmentMap, normals: np.ndarray, height: int = 96) -> np.ndarray:

@@ -177,7 +177,7 @@ def test_shadows_tell_where_the_sun_is(scene, transport) -> None:
     environment, towards = sunny()
     points = points_of(scene, transport, environment)
     soft = fit_light(points, QUICK, 0)
-    search = SunSearch(transport.tracer, points, soft, 0.0, QUICK.robust, QUICK.alike, 0)
+    search = SunSearch(transport.tracer, points, soft, 0.0, 0)
     direction, strength = search.find()
     assert np.degrees(np.arccos(direction @ towards)) < 3
     width, strength = search.width(direction, strength)
@@ -232,7 +232,7 @@ def test_a_sun_is_sought_above_the_horizon(scene, transport) -> None:
     lit = points.color * (0.2 + 3 * np.maximum(points.normal @ below, 0))[:, None]
     points = replace(points, color=lit.astype(np.float32))
     soft = fit_light(points, QUICK, 0)
-    search = SunSearch(transport.tracer, points, soft, 0.0, QUICK.robust, QUICK.alike, 0)
+    search = SunSearch(transport.tracer, points, soft, 0.0, 0)
     assert search.find()[0] @ scene.up > 0
 
 
@@ -280,8 +280,8 @@ def test_patches_bear_bumps_that_no_photo_shows(scene, transport) -> None:
 
     def seen(radius: float) -> tuple[float, float]:
         """Share of the differences that the true sun explains; degrees from it to the one that is found."""
-        points = bumpy.averaged(bumpy.patches(radius, QUICK.alike))
-        search = SunSearch(transport.tracer, bumpy, soft, radius, QUICK.robust, QUICK.alike, 0)
+        points = bumpy.averaged(bumpy.patches(radius))
+        search = SunSearch(transport.tracer, bumpy, soft, radius, 0)
         lit = replace(points, lobe=search.received(towards, 0.03))
         explained = 1 - search.loss(replace(soft, sun=sun), lit) / search.loss(soft, points)
         return explained, float(np.degrees(np.arccos(search.find()[0] @ towards)))

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from tron.reconstruction.light import fit_pairs
 from tron.reconstruction.light.fit_pairs import Light, LightSettings, Points, _spread, fit_light
 from tron.reconstruction.light.sky_visibility import PhotographedSky, cube_texels
 from tron.seeds import generator
@@ -57,12 +58,15 @@ def test_the_scale_is_that_of_the_brightest_paint(variant: str, brightest: float
 
 
 @pytest.mark.parametrize("darkness", [0.1, 0.5])
-def test_where_nothing_looks_it_is_as_dark_as_is_said(variant: str, darkness: float) -> None:
+def test_where_nothing_looks_it_is_as_dark_as_is_said(
+    variant: str, darkness: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(fit_pairs, "_DARKNESS", darkness)
     directions, _ = cube_texels(RESOLUTION)
     points = points_under(lamp(), patches(), upwards=True)
     unseen = directions[:, 2] < -0.8
     assert points.transport[:, unseen].max() == 0
-    texels = fit_light(points, SETTINGS.model_copy(update={"darkness": darkness}), 0).texels
+    texels = fit_light(points, SETTINGS, 0).texels
     # The radiance of a direction is the mean of its channels' logarithms.
     grey = np.exp(np.log(texels).mean(1))
     assert grey[unseen].mean() / grey.mean() == pytest.approx(darkness, rel=0.4)
@@ -93,12 +97,16 @@ def colourfulness(texels: np.ndarray) -> float:
     return float(np.ptp(np.log(texels[:, 0] / texels[:, 2])))
 
 
-def test_fine_levels_and_colours_are_held_back_by_their_weights(variant: str) -> None:
+def test_fine_levels_and_colours_are_held_back_by_their_weights(
+    variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     points = points_under(lamp(), patches())
-    free, smooth, grey = (
-        fit_light(points, SETTINGS.model_copy(update=update), 0).texels
-        for update in ({}, {"smooth": 100.0}, {"grey": 100.0})
-    )
+    free, found = fit_light(points, SETTINGS, 0).texels, []
+    for weight in ("_SMOOTH", "_GREY"):
+        with monkeypatch.context() as changed:
+            changed.setattr(fit_pairs, weight, 100.0)
+            found.append(fit_light(points, SETTINGS, 0).texels)
+    smooth, grey = found
     assert fineness(smooth) < 0.01 < 0.1 < fineness(free)
     assert colourfulness(grey) < 0.05 < 1 < colourfulness(free)
     assert fineness(grey) > 0.1
@@ -122,18 +130,19 @@ def error(found: Light, points: Points, truth: np.ndarray) -> float:
     return float(np.linalg.norm(factor * received - direct) / np.linalg.norm(direct))
 
 
-def test_what_differs_in_colour_is_not_taken_for_a_shadow(variant: str) -> None:
+def test_what_differs_in_colour_is_not_taken_for_a_shadow(
+    variant: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
     """Everything that faces +x is light red, the rest dark blue, in a light that is the same everywhere.
 
-    With a large ``robust`` no pair is doubted for its difference: its weight alone spares the light.
+    With a large ``ROBUST`` no pair is doubted for its difference: its weight alone spares the light.
     """
     even = np.full((6 * RESOLUTION**2, 3), 0.7)
     points = points_under(even)
     red = points.normal[:, 0] > 0
     paint = np.where(red[:, None], (0.8, 0.5, 0.4), (0.08, 0.12, 0.2))
-    found = fit_light(
-        replace(points, color=points.color / 0.5 * paint), SETTINGS.model_copy(update={"robust": 2.0}), 0
-    )
+    monkeypatch.setattr(fit_pairs, "ROBUST", 2.0)
+    found = fit_light(replace(points, color=points.color / 0.5 * paint), SETTINGS, 0)
     received = found.irradiance(points).mean(1)
     assert received[red].mean() / received[~red].mean() == pytest.approx(1, abs=0.05)
 

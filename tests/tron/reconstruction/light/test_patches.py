@@ -19,7 +19,7 @@ def grid(side: int = 20) -> np.ndarray:
 
 def test_a_constant_stays_and_noise_goes() -> None:
     place = grid()
-    patches = Patches.of(place, np.tile(UP, (400, 1)), np.full((400, 3), 0.5), 1.5, 0.12)
+    patches = Patches.of(place, np.tile(UP, (400, 1)), np.full((400, 3), 0.5), 1.5)
     np.testing.assert_allclose(patches.mean(np.full((400, 3), 2.0)), 2.0, rtol=1e-6)
     noise = generator(0, "tests", "patches").normal(size=400)
     # A Gaussian of standard deviation s over a unit grid keeps 1 / (4 pi s^2) of a variance.
@@ -36,11 +36,11 @@ def test_they_stop_where_another_surface_begins(edge: str) -> None:
         color[beyond] = (0.5, 0.2, 0.2)
     else:
         place[beyond] += 50.0
-    mixed = Patches.of(place, normal, color, 2.0, 0.12).mean(beyond.astype(float))
+    mixed = Patches.of(place, normal, color, 2.0).mean(beyond.astype(float))
     np.testing.assert_allclose(mixed, beyond, atol=1e-3)
 
 
 def test_without_a_radius_each_point_is_alone() -> None:
     values = generator(1, "tests", "patches").normal(size=(400, 2))
-    alone = Patches.of(grid(), np.tile(UP, (400, 1)), np.full((400, 3), 0.5), 0.0, 0.12)
+    alone = Patches.of(grid(), np.tile(UP, (400, 1)), np.full((400, 3), 0.5), 0.0)
     np.testing.assert_allclose(alone.mean(values), values, rtol=1e-6)

@@ -17,7 +17,7 @@ from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.tracing import SurfelTracer, reference
 from tron.tracing.kernel import MIN_ALPHA, MIN_RESPONSE, T_MIN, SurfelRecords
-from tron.tracing.tiled.tiles import TILE, build_tiles
+from tron.tracing.tiled.tiles import TILE, build_tiles, tile_counts
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -97,7 +97,7 @@ def listed(tracer: SurfelTracer, camera: Camera) -> np.ndarray:
         on_list[tile, entries[part]] = near[part]
         assert (np.diff(near[part]) >= 0).all()
     y, x = np.mgrid[: camera.height, : camera.width] // TILE
-    return on_list[(y * lists.tiles_x + x).ravel()]
+    return on_list[(y * tile_counts(camera.width, camera.height)[0] + x).ravel()]
 
 
 tally: Counter[str] = Counter()
