@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {
-    "tron": (2_900, 18),
+    "tron": (2_950, 18),
     "tron/apps": (3_500, 22),
     "tron/brdf": (800, 7),
     "tron/captures": (5_200, 34),

@@ -91,7 +91,7 @@ class Clip:
         averaged: bool,
     ) -> Clip:  # fmt: skip
         """The clip that settings of one light ask for; ``averaged``: along motion, by a network."""
-        picture = RelitPicture(light.background, light.source, light.look, light.denoise == "oidn")
+        picture = RelitPicture(light.background, light.source, light.look, light.denoiser)
         needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
         buffers = tuple(dict.fromkeys(name for name in needed if name != "relit"))
         return cls(
@@ -330,8 +330,8 @@ def _shade(
 
     names = clip.folder.buffers
     frame = light.trace(camera, seed)
-    if clip.picture.denoised:
-        frame = frame.denoised(surfaces()[0]["albedo"])
+    if clip.picture.denoiser is not None:
+        frame = frame.denoised(clip.picture.denoiser, surfaces()[0])
     guidance = frame.shade()
     # The share is no linear function of opacity: a pixel has the mean of those of its sub-pixels.
     transmittance = 1 - frame.view.images({"opacity": frame.view.opacity})["opacity"]

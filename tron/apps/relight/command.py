@@ -24,7 +24,7 @@ from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.cli.recipes import model_defaults
-from tron.denoising import require_oidn
+from tron.denoising import require
 from tron.editing.models import foot_of, read_model
 from tron.editing.motion import Motion
 from tron.editing.moving import MovingScene, in_motion
@@ -115,8 +115,8 @@ def _read(settings: Settings) -> _Given:
     """Find and read everything that can be wrong before the scan, which takes longer."""
     from tron.shading.environments.environment import EnvironmentMap  # Mitsuba: not for --help
 
-    if settings.denoise == "oidn":
-        require_oidn("denoise=oidn")
+    if settings.denoiser is not None:
+        require(settings.denoiser, f"denoise={settings.denoiser}")
     _check_paths(settings)
     settings = settings.shaped()
     file, cameras = settings.cameras, None

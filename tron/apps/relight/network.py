@@ -1,4 +1,4 @@
-"""Who draws the pictures of tron-relight: a network, Open Image Denoise, or neither."""
+"""Who draws the pictures of tron-relight: a network, a denoiser, or neither."""
 
 from __future__ import annotations
 
@@ -8,10 +8,10 @@ from typing import TYPE_CHECKING, Any
 
 from tron.apps.relight.settings import Settings
 from tron.cli.installation import lacks_extra
-from tron.denoising import require_oidn
+from tron.denoising import DENOISERS, lacking
 from tron.errors import TronError, located
 from tron.neural.clips import check_frames
-from tron.neural.network_gains import Way, best_first, quality_of
+from tron.neural.network_gains import NETWORK, Way, best_first, quality_of
 from tron.neural.shipped import DEFAULT, checkpoint_file
 from tron.runtime import set_torch_threads, torch_device
 from tron.shards.schema import GUIDANCE
@@ -22,17 +22,15 @@ if TYPE_CHECKING:
 
 log = logging.getLogger(__name__)
 
-TITLES: dict[Way, str] = {"network": DEFAULT, "oidn": "Open Image Denoise"}
-
 
 def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     """The settings as they will be followed, and the network on its device, or None without one.
 
     A checkpoint that was asked for has to fit. checkpoint=auto takes what surely gains most at that size and
-    quality (:mod:`tron.neural.network_gains`): the shipped network, Open Image Denoise where it is
-    installed and light bounces, or neither; a line in the log says which, and by how much. The network gives
-    way where its libraries or its file are not installed; where nothing bounces and it is given lit; where
-    denoise=oidn is. Radiance that is asked for stays as it was traced. Where window, overlap, reproject or
+    quality (:mod:`tron.neural.network_gains`): the shipped network, a denoiser that is installed where light
+    bounces, or neither; a line in the log says which, and by how much. The network gives way where its
+    libraries or its file are not installed; where nothing bounces and it is given lit; where denoise= names a
+    denoiser. Radiance that is asked for stays as it was traced. Where window, overlap, reproject or
     weights are chosen, the network has to fit too.
 
     Raises:
@@ -49,18 +47,19 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
     quality = quality_of(estimation.supersample, estimation.reflections)
     gains = best_first(_ways(settings), quality, width, height)
     found = f"at least on validation scenes, {quality} at {width} x {height}"
+    titles = {way: DEFAULT if way == NETWORK else DENOISERS[way].title for way in gains}
     for way, gain in gains.items():
-        others = [f"; {TITLES[each]} {dB:+.2f}" for each, dB in gains.items() if each != way]
+        others = [f"; {titles[each]} {dB:+.2f}" for each, dB in gains.items() if each != way]
         said = "".join([f"{gain:+.2f} dB {found}", *others])
-        if way == "oidn" and gain > 0:
-            log.info("%s draws the pictures: %s", TITLES[way], said)
-            return settings.model_copy(update={"checkpoint": None, "denoise": "oidn"}), None
-        if way == "oidn":
+        if way != NETWORK:
+            if gain > 0:
+                log.info("%s draws the pictures: %s", titles[way], said)
+                return settings.model_copy(update={"checkpoint": None, "denoise": way}), None
             continue
         drawn = settings.model_copy(update={"checkpoint": Path(DEFAULT)})
         renderer = _unwanted(settings, gain, said) or _loaded(drawn)
         if not isinstance(renderer, TronError):
-            log.info("%s draws the pictures: %s", TITLES[way], said)
+            log.info("%s draws the pictures: %s", DEFAULT, said)
             return drawn, renderer
         if settings.tuned:
             raise renderer
@@ -71,23 +70,17 @@ def chosen_network(settings: Settings) -> tuple[Settings, Renderer | None]:
 def _ways(settings: Settings) -> list[Way]:
     """What checkpoint=auto chooses from.
 
-    Open Image Denoise is no answer to settings of a network, and leaves radiance that is asked for as it is.
+    A denoiser is no answer to settings of a network, and leaves radiance that is asked for as it is.
     """
-    ways: list[Way] = ["network"]
-    asked = settings.tuned or "relit" in settings.buffers
-    if settings.bounces and settings.denoise is True and not asked:
-        try:
-            require_oidn("checkpoint=auto")
-        except TronError:  # not installed here, or not for this machine
-            return ways
-        ways.append("oidn")
-    return ways
+    if not settings.bounces or settings.denoise is not True or settings.tuned or "relit" in settings.buffers:
+        return [NETWORK]
+    return [NETWORK, *(name for name in DENOISERS if lacking(name, "checkpoint=auto") is None)]
 
 
 def _unwanted(settings: Settings, gain: float, said: str) -> TronError | None:
     """Why checkpoint=auto does without the shipped network before it is loaded; None: it does not."""
-    if settings.denoise == "oidn":
-        return TronError("denoise=oidn draws the pictures")
+    if settings.denoiser is not None:
+        return TronError(f"denoise={settings.denoiser} draws the pictures")
     if "relit" in settings.buffers:
         return TronError("buffers ask for relit.exr, and a network draws display values")
     if gain > 0:

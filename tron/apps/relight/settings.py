@@ -13,6 +13,7 @@ from tron.apps.relit import Background
 from tron.apps.scene_file import GROUND, SURROUNDINGS, FoundMaterials, SeenAs, Up
 from tron.apps.splat_file import SceneFile
 from tron.color import Look
+from tron.denoising import DENOISERS, DenoiserName
 from tron.editing.models import PlacedModel
 from tron.editing.motion import Motion
 from tron.errors import TronError
@@ -140,11 +141,11 @@ class Settings(BaseModel):
         FINAL.two_sided,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    denoise: bool | Literal["oidn"] = Field(
+    denoise: DenoiserName | bool = Field(
         True,
-        description="filter of the shadows' noise; false: as they are traced; oidn: filtered, and the relit "
-        "picture besides by Intel's Open Image Denoise, led by base color, in place of a network "
-        "(pip install 'tron-relight[oidn]')",
+        description="filter of the shadows' noise; false: as they are traced; or a denoiser of the relit "
+        "picture besides, in place of a network: "
+        + ", ".join(f"{name}, {row.title} ({row.mend})" for name, row in DENOISERS.items()),
     )
     frames: int = Field(
         60,
@@ -176,9 +177,9 @@ class Settings(BaseModel):
     checkpoint: DisplayOnly[Path | None] = Field(
         Path(AUTO),
         description="renderer.safetensors, or the name of a checkpoint that comes with the package "
-        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT}, or "
-        "denoise=oidn where it is installed, whichever surely makes the picture better, or neither, as the "
-        "log says; null: no network. A network wants pip install 'tron-relight[network]'",
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT}, or a "
+        "denoiser that is installed, whichever surely makes the picture better, or neither, as the log says; "
+        "null: no network. A network wants pip install 'tron-relight[network]'",
         examples=["paper"],
     )
     window: DisplayOnly[int | None] = Field(
@@ -227,15 +228,6 @@ class Settings(BaseModel):
         found = [own if str(each) == "capture" else each for each in (given if several else [given])]
         return {**data, "environment": found if several else found[0]}
 
-    @model_validator(mode="after")
-    def _has_radiance(self) -> Settings:
-        if self.checkpoint is not None and "relit" in self.buffers and not self.takes_default:
-            raise ValueError(
-                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
-                "out of buffers, or take 'shadowed'"
-            )
-        return self
-
     @field_validator("weights")
     @classmethod
     def _weigh_something(cls, weights: dict[str, float] | None) -> dict[str, float] | None:
@@ -244,18 +236,19 @@ class Settings(BaseModel):
         return weights
 
     @model_validator(mode="after")
-    def _draws_what_it_tunes(self) -> Settings:
+    def _drawn_by_one(self) -> Settings:
+        asked = self.checkpoint is not None and not self.takes_default
+        if asked and "relit" in self.buffers:
+            raise ValueError(
+                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
+                "out of buffers, or take 'shadowed'"
+            )
+        if asked and self.denoiser is not None:
+            both = f"denoise={self.denoiser} and a checkpoint would both draw the picture"
+            raise ValueError(f"{both}: leave one of the two out")
         if self.tuned and self.checkpoint is None:
             what = f"{self.tuned[0]} is the neural renderer's"
             raise ValueError(f"{what}: give a checkpoint too, or leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _drawn_by_one(self) -> Settings:
-        if self.denoise == "oidn" and self.checkpoint is not None and not self.takes_default:
-            raise ValueError(
-                "denoise=oidn and a checkpoint would both draw the picture: leave one of the two out"
-            )
         return self
 
     @model_validator(mode="after")
@@ -298,7 +291,7 @@ class Settings(BaseModel):
         for model, said in zip(self.meshes, made["meshes"]):
             del said["file"]
             said["sha256"] = sha256(model.file)
-        if isinstance(self.denoise, bool):
+        if self.denoiser is None:
             del made["denoise"]  # `filtered` says it
         if (filmed := self.scene.with_name(CAMERAS)).is_file():
             made["filmed_sha256"] = sha256(filmed)
@@ -317,6 +310,11 @@ class Settings(BaseModel):
             "reproject": self.reproject != 5,
         }
         return [name for name, given in chosen.items() if given]
+
+    @property
+    def denoiser(self) -> str | None:
+        """Name of the denoiser that the relit picture goes through."""
+        return None if isinstance(self.denoise, bool) else self.denoise
 
     @property
     def takes_default(self) -> bool:
