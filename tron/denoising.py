@@ -82,7 +82,7 @@ def installed() -> list[str]:
 
 
 def lacking(name: str, what: str) -> TronError | None:
-    """Why a denoiser does not run here, None: it does; ``what``: the setting that needs it, for the message."""
+    """Why a denoiser does not run here, None: it does; ``what``: the setting that needs it, to be named."""
     row = DENOISERS[name]
     try:
         row.load()
