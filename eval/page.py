@@ -22,6 +22,7 @@ from eval.report.figures import bound, interval_note, left_out, row_cell, verdic
 from eval.report.outcome import load_group
 from eval.results import Results, Row
 from eval.stages import StageFile
+from tron.denoising import DENOISERS
 from tron.errors import TronError
 from tron.report.charts import line_chart
 from tron.report.page import Cell, Chart, Code, Films, Pictures, Table, Tile, format_value
@@ -47,6 +48,7 @@ def write_page(folder: Path) -> Path:
     titles = {method.name: method.title for method in METHODS}
     names |= {"metrics": METRICS, "methods": titles, "what": {method.name: method.what for method in METHODS}}
     names |= {"measures": MEASURES, "map_measures": MAP_MEASURES, "published": published}
+    names["denoisers"] = {name: row.title for name, row in DENOISERS.items()}
     names["underscored"] = {name.replace(".", "_"): title for name, title in titles.items()}
     page = render_template("eval.report", template, brand="benchmark report", **names)
     write_atomic(path, page)

@@ -21,7 +21,7 @@ from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import Child, Stages, script_path
 from tron.cli.installation import require_own_packages
-from tron.denoising import require_oidn
+from tron.denoising import require
 
 Part = Literal["true_maps", "photos", "mesh_peer"]
 NETWORK, WITHOUT = "maps_network", "maps_"
@@ -44,7 +44,7 @@ class Synthetic(Benchmark):
         require_own_packages("datagen", "tron.reconstruction")
         for script in ("tron-eval", "tron-datagen", "tron-reconstruct"):
             script_path(script)
-        require_oidn("benchmark=tron_synth")
+        require("oidn", "benchmark=tron_synth")  # of the mesh, and a way
 
     def run(self, output_dir: Path) -> Outcome:
         """Run the stages that are not finished; judge anew.

@@ -45,6 +45,8 @@ Track = Callable[[Iterable[Any], str], Iterable[Any]]
 
 COVERED = 0.999
 """Coverage from which a photo's pixel shows nothing but surfaces."""
+DENOISER = "oidn"
+"""Of the frames."""
 BOUNCES = 4
 """Of a rendered frame's light between surfaces, as the truth has."""
 MATERIALS = {"base_color": 3, "roughness": 1, "metallic": 1}
@@ -204,7 +206,8 @@ def lit_frames(
         found = np.array(
             mi.render(scene, sensor=sensor, integrator=integrator, spp=spp, seed=mi.UInt32(seed))
         )
-        yield denoised(np.maximum(found[..., :3], 0), np.clip(found[..., -3:], 0, 1))
+        guides = {"albedo": np.clip(found[..., -3:], 0, 1)}
+        yield denoised(DENOISER, np.maximum(found[..., :3], 0), guides)
 
 
 def surface_maps(mesh: PaintedMesh, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:

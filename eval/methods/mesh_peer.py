@@ -15,7 +15,7 @@ import numpy as np
 from pydantic import Field
 
 from eval.methods.making import Making
-from eval.methods.mesh_fit import MeshSettings, fit_mesh, lit_frames, surface_maps
+from eval.methods.mesh_fit import DENOISER, MeshSettings, fit_mesh, lit_frames, surface_maps
 from eval.protocol.method import Method, MethodWriter, write_method
 from eval.protocol.suite import SuiteScene
 from tron.captures import Capture
@@ -23,7 +23,7 @@ from tron.captures.folder import read_capture_folder
 from tron.captures.view import MAPS
 from tron.cli.installation import require_own_packages
 from tron.cli.progress import track
-from tron.denoising import require_oidn
+from tron.denoising import require
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction import Prior, reconstruct
 from tron.reconstruction.priors.prior import Materials, Surfels
@@ -64,7 +64,7 @@ class MeshPeer(Making):
         """Scene by scene: surfels, mesh, fit, frames; a scene that is all there is passed over."""
         suite = self.read_suite()
         require_own_packages("tron.reconstruction")
-        require_oidn("method=mesh_peer")
+        require(DENOISER, "method=mesh_peer")
         settings = self.surfels
         activate()
         set_torch_threads(1)  # as tron-reconstruct has it: two would wait for each other beside Dr.Jit's

@@ -13,7 +13,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack
 from pathlib import Path
-from typing import Literal
+from typing import TYPE_CHECKING, Literal
 
 import numpy as np
 from pydantic import Field, PositiveInt
@@ -21,7 +21,7 @@ from pydantic import Field, PositiveInt
 from eval.methods.making import Making
 from eval.protocol.method import ColorSpace, Given, Method, MethodWriter, write_method
 from eval.protocol.suite import Suite, SuiteScene
-from eval.relighting.baselines import shadow_ratio
+from eval.relighting import baselines
 from eval.relighting.buffers import Buffers
 from eval.relighting.fits import product_terms
 from eval.relighting.networks import Network, load_networks
@@ -30,7 +30,7 @@ from tron.cameras import Camera
 from tron.captures.folder import read_capture_folder
 from tron.cli.installation import require_own_packages
 from tron.color import from_agx
-from tron.denoising import require_oidn
+from tron.denoising import require
 from tron.errors import TronError
 from tron.estimation import QUALITY
 from tron.gaussians.initialize import GBufferView, surfels_from_gbuffers
@@ -41,26 +41,27 @@ from tron.seeds import integer
 
 log = logging.getLogger("tron.eval")
 
-Way = Literal["pbr", "pbr_x_irradiance", "shadow_ratio", "shadowed", "lit", "lit_oidn", "network"]
-OIDN = "lit_oidn"
-LINEAR: Mapping[str, Callable[[Buffers], np.ndarray]] = {
-    "pbr": lambda buffers: buffers["pbr"],
-    "pbr_x_irradiance": lambda buffers: sum(product_terms(buffers)) / buffers.exposure,  # pyright: ignore
-    "shadow_ratio": shadow_ratio,
-    "shadowed": lambda buffers: buffers["shadowed"],
-    "lit": lambda buffers: buffers["lit"],
-    OIDN: lambda buffers: buffers[OIDN],
-}
-"""Way -> linear radiance (K, H, W, 3). The product's fitted number is left to the factor on light."""
+DENOISED = {each.name: name for name, each in baselines.DENOISED.items()}
+"""Way -> the denoiser that it is through."""
 TITLES = {
     "pbr": "split sum, no shadows",
     "pbr_x_irradiance": "pbr × irradiance",
     "shadow_ratio": "pbr × share of light",
     "shadowed": "shadowed",
     "lit": "lit",
-    OIDN: "lit, OIDN",
+    **{each.name: each.title for each in baselines.DENOISED.values()},
     "network": "neural renderer",
 }
+if TYPE_CHECKING:
+    Way = str
+else:
+    Way = Literal[tuple(TITLES)]
+MADE: Mapping[str, Callable[[Buffers], np.ndarray]] = {
+    "pbr_x_irradiance": lambda buffers: sum(product_terms(buffers)) / buffers.exposure,  # pyright: ignore
+    "shadow_ratio": baselines.shadow_ratio,
+}
+"""Way -> linear radiance (K, H, W, 3), of those that are no buffer themselves. The product's fitted number is
+left to the factor on light."""
 _FIELDS = ("depth", "normal", "base_color", "roughness", "metallic")
 
 
@@ -80,8 +81,8 @@ class Surfels(Making):
     def make(self, output_dir: Path) -> list[Path]:
         """Scene by scene: surfels, lights, frames; a scene whose folders are all there is passed over."""
         suite, stages = self.read_suite(), None
-        if OIDN in self.ways:
-            require_oidn("method.ways=[lit_oidn]")
+        for way in DENOISED.keys() & self.ways:
+            require(DENOISED[way], f"method.ways=[{way}]")
         if "network" in self.ways and suite.file.tone_curve != "agx":
             raise TronError(
                 "the network was trained on AgX pictures", suite.folder, "leave network out of method.ways"
@@ -173,7 +174,7 @@ class Surfels(Making):
                     if self.surfels == "photos":
                         shown = from_agx(shown) / np.float32(of_light.exposure)
                 else:
-                    shown = LINEAR[way](buffers)
+                    shown = MADE[way](buffers) if way in MADE else buffers[way]
                 writer.frames(scene.name, light, shown)
         maps = [relighter.gbuffer(camera).numpy() for camera in scene.cameras]
         for writer in writers.values():
@@ -192,8 +193,8 @@ class Surfels(Making):
         images = {
             name: guidance[name] for name in ("pbr", "irradiance", "unshadowed", "shadowed", "lit", "mask")
         }
-        if OIDN in self.ways:
-            images[OIDN] = frame.denoised(maps["albedo"]).shade().lit
+        for way in DENOISED.keys() & self.ways:
+            images[way] = frame.denoised(DENOISED[way], maps).shade().lit
         return images | maps
 
 

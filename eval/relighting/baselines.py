@@ -21,8 +21,7 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``lit_bilateral``: D(L) by a cross-bilateral filter (:mod:`eval.relighting.bilateral`).
 - ``lit_blended``: an affine blend of G(D(L)), G(D(B)), G(D(E)), G(S(A)) and S(A), weights and deviation by
   the mean PSNR of training frames (`PsnrAffineFit`).
-- ``lit_oidn``: D of L through Open Image Denoise with ``albedo`` (:mod:`tron.denoising`), where pyoidn is
-  installed.
+- ``lit_NAME``, such as ``lit_oidn``: D of L through each denoiser that is installed (:mod:`tron.denoising`).
 - ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
@@ -41,7 +40,6 @@ A new baseline is one more entry of BASELINES: scores, tables and pictures itera
 
 from __future__ import annotations
 
-import importlib.util
 import time
 from collections.abc import Callable, Iterable, Mapping, MutableMapping
 from dataclasses import dataclass
@@ -64,7 +62,7 @@ from eval.relighting.fits import (
     remodulated,
 )
 from tron.color import to_display
-from tron.denoising import denoised
+from tron.denoising import DENOISERS, denoised, installed
 from tron.errors import TronError
 from tron.seeds import generator
 from tron.shards.schema import Clip, guidance_members
@@ -113,9 +111,14 @@ def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
     return to_display(shadow_ratio(buffers), buffers.exposure)
 
 
-def show_oidn(buffers: Buffers) -> np.ndarray:
-    """Displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame (:mod:`tron.denoising`)."""
-    return to_display(np.stack([*map(denoised, buffers["lit"], buffers["albedo"])]), buffers.exposure)
+def show_denoised(buffers: Buffers, name: str) -> np.ndarray:
+    """Displayed ``lit`` of whole clips (K, H, W, 3), through a denoiser frame by frame."""
+    guides = {each: buffers[each] for each in DENOISERS[name].wants}
+    frames = [
+        denoised(name, lit, {each: images[k] for each, images in guides.items()})
+        for k, lit in enumerate(buffers["lit"])
+    ]
+    return to_display(np.stack(frames), buffers.exposure)
 
 
 @dataclass(frozen=True)
@@ -163,15 +166,20 @@ class Baseline(Method):
 NEURAL_LIT = Method("neural_lit", "neural renderer", "filters lit and adds what is missing")
 NEURAL = Method("neural", "neural renderer of two buffers", "the same of pbr and irradiance alone")
 NETWORKS = (NEURAL_LIT, NEURAL)
-OIDN = Baseline(
-    "lit_oidn",
-    "lit, Open Image Denoise",
-    "Intel's denoiser on linear lit, led by base color",
-    show_oidn,
-    groups=(ON_LIT,),
-    pictured=False,
-)
-"""Among the baselines where pyoidn is installed."""
+DENOISED = {
+    name: Baseline(
+        f"lit_{name}",
+        f"lit, {row.title}",
+        f"{row.what}, on linear lit",
+        partial(show_denoised, name=name),
+        groups=(ON_LIT,),
+        optional="normal" in row.wants,
+        pictured=False,
+        needs="normal" if "normal" in row.wants else None,
+    )
+    for name, row in DENOISERS.items()
+}
+"""Denoiser -> its baseline, which is among the others where it is installed."""
 BASELINES = (
     Baseline("pbr", "pbr", "split-sum shading of the surfels, no shadows", show_pbr, groups=(SIMPLE, DIRECT)),
     Baseline(
@@ -288,7 +296,7 @@ BASELINES = (
         groups=(ON_LIT,),
         pictured=False,
     ),
-    *((OIDN,) if importlib.util.find_spec("pyoidn") else ()),
+    *(DENOISED[name] for name in installed()),
     Baseline(
         "affine_lit",
         "affine blend with lit",

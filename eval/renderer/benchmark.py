@@ -10,7 +10,7 @@ from typing import Any
 
 import numpy as np
 
-from eval.relighting.baselines import BASELINES, NEURAL_LIT, OIDN, fit_baselines
+from eval.relighting.baselines import BASELINES, DENOISED, NEURAL_LIT, fit_baselines
 from eval.relighting.buffers import MEMBERS
 from eval.relighting.fits import Show
 from eval.relighting.judging import Judged, judge
@@ -38,6 +38,7 @@ from eval.report.outcome import Outcome
 from eval.results import Row
 from eval.stages import script_path
 from tron.cli.installation import require_own_packages
+from tron.denoising import DENOISERS
 from tron.errors import TronError
 from tron.runtime import set_torch_threads
 from tron.seeds import generator
@@ -67,8 +68,9 @@ class Renderer(RendererSettings):
             script_path(name)
         require_data(self)
         load_networks("neural", self.weights())
-        if OIDN not in BASELINES:
-            log.warning("no rows of Open Image Denoise: it wants pip install 'tron-relight[oidn]'")
+        for name, row in DENOISERS.items():
+            if DENOISED[name] not in BASELINES:
+                log.warning("no rows of %s: it wants %s", row.title, row.mend)
 
     def run(self, output_dir: Path) -> Outcome:
         """Measure part after part; one line on stderr for each figure.

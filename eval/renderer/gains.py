@@ -14,7 +14,7 @@ from collections.abc import Iterable, Iterator, Mapping, Sequence
 import numpy as np
 
 from eval.confidence import quotient, scene_sums, without_one
-from eval.relighting.baselines import DIRECT, NEURAL, NEURAL_LIT, OIDN, ON_LIT
+from eval.relighting.baselines import DENOISED, DIRECT, NEURAL, NEURAL_LIT, ON_LIT
 from eval.relighting.buffers import MATERIALS, REGIONS
 from eval.relighting.scores import GROUPS, Scores, Where
 from eval.renderer.sharpness import sharpness_rows
@@ -34,14 +34,14 @@ LIT_RIVALS: dict[str, list[str]] = {
     "gain_db": ["lit", *GROUPS[ON_LIT]],
     "gain_over_pixelwise_db": PIXELWISE,
     "gain_over_lit_db": ["lit"],
-    "gain_over_oidn_db": [OIDN.name],
+    **{f"gain_over_{name}_db": [each.name] for name, each in DENOISED.items()},
 }
 RIVALS = {NEURAL.name: ("renderer", PAIR_RIVALS), NEURAL_LIT.name: ("renderer.lit", LIT_RIVALS)}
 """Method -> beginning of its rows, and what its gains are over by the end of their names."""
 INPUT = {NEURAL.name: "pbr", NEURAL_LIT.name: "lit"}
 """Method -> what it starts from."""
 WORST, WORST_OVER_INPUT, KEPT = "worst_scene_gain_db", "worst_scene_over_input_db", "gain_kept"
-WORST_OVER_OIDN = "worst_scene_over_oidn_db"
+WORST_OVER = {f"worst_scene_over_{name}_db": [each.name] for name, each in DENOISED.items()}
 """Ends of the names of rows on single scenes; see :func:`scene_rows`."""
 
 
@@ -81,7 +81,7 @@ def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Ro
 
     The gain without the scene that raises it most, and the share of it that this keeps (0 where there is no
     gain); the least gain of a scene over the rival that is the best there, over what the network starts
-    from, and, with lit, over Open Image Denoise.
+    from, and, with lit, over each denoiser.
     """
     for method, (start, rivals) in RIVALS.items():
         known = {each.name for each in scores.methods}
@@ -97,7 +97,7 @@ def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Ro
             yield Row(metric=f"{name}{KEPT}{tail}", value=kept, unit="fraction", n=count)
         ends = {WORST: over, WORST_OVER_INPUT: [INPUT[method]]}
         if method == NEURAL_LIT.name:
-            ends[WORST_OVER_OIDN] = [OIDN.name]
+            ends |= WORST_OVER
         for end, others in ends.items():
             by_scene = scores.scene_gains(method, others)
             if by_scene:
@@ -126,7 +126,7 @@ def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator
     """Of metals and of the rest by themselves, over frames that have both, or one: PSNRs and gains.
 
     What carries a mean is seen: ``rest`` is the gain without metals. PSNRs are those of the networks, lit and
-    Open Image Denoise.
+    denoisers.
     """
     known = {each.name for each in scores.methods}
     for where in map(Where, MATERIALS):
@@ -136,7 +136,7 @@ def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator
                 there = [each for each in over if each in known]
                 if row := scores.gain_row(f"{start}.{prefix}{gain}{end}", method, there, where, seed):
                     yield row
-        for method in (*RIVALS, "lit", OIDN.name):
+        for method in (*RIVALS, "lit", *(each.name for each in DENOISED.values())):
             if row := scores.mean_row(f"renderer.{prefix}psnr.{method}{end}", method, where, seed):
                 yield row
 
@@ -172,7 +172,7 @@ def time_rows(prefix: str, seconds: Mapping[str, Sequence[float]], size: int) ->
 def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
     """The least of each row on single scenes of the network that starts from lit, of all that was judged."""
     found = list(rows)
-    for end in (WORST, WORST_OVER_INPUT, WORST_OVER_OIDN, KEPT):
+    for end in (WORST, WORST_OVER_INPUT, *WORST_OVER, KEPT):
         pattern = re.compile(rf"renderer\.lit\.([a-z]+_)*{end}(\.\d+)?")
         if there := [row for row in found if pattern.fullmatch(row.metric)]:
             least = min(there, key=lambda row: row.value)

@@ -15,7 +15,7 @@ from itertools import combinations
 import numpy as np
 
 from eval.confidence import interval, scene_sums
-from eval.relighting.baselines import NEURAL_LIT, OIDN
+from eval.relighting.baselines import DENOISED, NEURAL_LIT
 from eval.relighting.scores import Score, Scores, Where
 from eval.renderer.truths import Truths
 from eval.results import Row
@@ -66,9 +66,9 @@ class Gradients:
 
 
 def sharpness_rows(prefix: str, scores: Scores, rivals: Sequence[str], tail: str, seed: int) -> Iterator[Row]:
-    """Sharpness of the network that starts from lit, of lit, of Open Image Denoise, and of the best rival.
+    """Sharpness of the network that starts from lit, of lit, of each denoiser, and of the best rival.
 
-    And the network's over Open Image Denoise's.
+    And the network's over each denoiser's.
 
     Args:
         prefix: before the word in the rows' names.
@@ -77,14 +77,17 @@ def sharpness_rows(prefix: str, scores: Scores, rivals: Sequence[str], tail: str
         tail: end of the names.
         seed: draws the scenes of the intervals.
     """
-    found = {name: of for name in (NEURAL_LIT.name, "lit", OIDN.name) if (of := _known(scores, name))}
+    denoisers = {name: each.name for name, each in DENOISED.items()}
+    methods = (NEURAL_LIT.name, "lit", *denoisers.values())
+    found = {name: of for name in methods if (of := _known(scores, name))}
     if (best := scores.best(rivals)) is not None and (of := _known(scores, best)):
         found[BEST_RIVAL] = of
     for name, of in found.items():
         yield from _ratio(f"renderer.{prefix}sharpness.{name}{tail}", of, _figures(of, TRUE), seed)
-    if {NEURAL_LIT.name, OIDN.name} <= found.keys():
-        ours, theirs = found[NEURAL_LIT.name], _figures(found[OIDN.name], OWN)
-        yield from _ratio(f"renderer.lit.{prefix}sharpness_over_oidn{tail}", ours, theirs, seed)
+    for name, method in denoisers.items():
+        if {NEURAL_LIT.name, method} <= found.keys():
+            ours, theirs = found[NEURAL_LIT.name], _figures(found[method], OWN)
+            yield from _ratio(f"renderer.lit.{prefix}sharpness_over_{name}{tail}", ours, theirs, seed)
 
 
 def _known(scores: Scores, method: str) -> list[Score]:

@@ -10,8 +10,9 @@ from collections import defaultdict
 from collections.abc import Iterator
 from pathlib import Path
 
-from eval.relighting.baselines import BASELINES, OIDN, show_oidn
+from eval.relighting.baselines import BASELINES, DENOISED
 from eval.relighting.buffers import MEMBERS, Buffers, region_mask
+from eval.relighting.fits import Show
 from eval.relighting.networks import Network
 from eval.renderer.identity import Identity
 from eval.results import Row, mean_row
@@ -24,11 +25,14 @@ from tron.shards.schema import TARGET
 def validation_rows(dataset: Path, split: str, network: Network, size: int, seed: int) -> Iterator[Row]:
     """Mean gains over lit of the clips of each quality, foreground, dB; and what becomes of the truth.
 
-    Of a network (``QUALITY_gain_db``) and of Open Image Denoise, where it is installed
+    Of a network (``QUALITY_gain_db``) and of each denoiser that is installed and wants no more than guidance
     (``QUALITY_oidn_gain_db``). checkpoint=auto goes by the lower ends of their intervals. ``seed`` draws the
     scenes of those.
     """
-    ways = {"": network.show} | ({"oidn_": show_oidn} if OIDN in BASELINES else {})
+    ways: dict[str, Show] = {"": network.show}
+    for name, each in DENOISED.items():
+        if each in BASELINES and each.show is not None and each.needs is None:
+            ways[f"{name}_"] = each.show
     found: dict[tuple[str, str], list[tuple[str, float]]] = defaultdict(list)
     kept: dict[str, Identity] = {}
     for clip in read_clips(dataset, split, MEMBERS):

@@ -32,7 +32,7 @@ class Zoo(Benchmark):
     lights: list[str] | None = Field(default=None, description="names of lights; null: all")
     materials: PositiveInt | None = Field(default=None, description="most of a shape's; null: all")
     real_data: Path | None = Field(description="folder with hdri; without it maps are drawn")
-    denoisers: bool = Field(default=True, description="Open Image Denoise and the shipped network too")
+    denoisers: bool = Field(default=True, description="denoisers and the shipped network too")
     blender_python: Path | None = Field(
         default=None, description="a Python that has bpy, of an environment of its own; null: no Cycles"
     )
@@ -72,7 +72,7 @@ class Zoo(Benchmark):
         from eval.zoo.shapes import individuals
         from eval.zoo.wall import draw_wall
         from eval.zoo.witness import chosen, witness_rows, witnessed
-        from tron.denoising import require_oidn
+        from tron.denoising import DENOISERS, lacking
         from tron.neural.shipped import DEFAULT, installed
         from tron.report.page import Picture, Pictures
 
@@ -85,20 +85,19 @@ class Zoo(Benchmark):
             if name not in names:
                 raise TronError(f"no light {name}", "benchmark.lights", f"they are {', '.join(names)}")
         lights = [light for light in lights if self.lights is None or light.name in self.lights]
-        networks, oidn = {}, self.denoisers
+        networks, denoisers = {}, []
         if self.denoisers and DEFAULT in installed():
             networks = {"network": load_networks("neural", [DEFAULT])["neural_lit"]}
-        if oidn:
-            try:
-                require_oidn("the zoo")
-            except TronError as error:
-                outcome.lack("zoo.psnr.preview_oidn", str(error))
-                oidn = False
+        for name in DENOISERS if self.denoisers else ():
+            if (error := lacking(name, "the zoo")) is None:
+                denoisers.append(name)
+            else:
+                outcome.lack(f"zoo.psnr.preview_{name}", str(error))
         cells, shapes = [], {}
         drawn = list(individuals(self.shapes, self.materials, self.seed))
         for shape, materials in track(drawn, "shapes"):
             shapes[shape.kind, shape.number] = shape
-            cells += measured(shape, materials, lights, self.seed, oidn, networks)
+            cells += measured(shape, materials, lights, self.seed, denoisers, networks)
         outcome.add(zoo_rows(cells))
         words = "every cell of the zoo, coloured by its mean, and the worst beside path tracing"
         outcome.show("wall", "wall", Pictures("The wall", [Picture(draw_wall(cells), "", words)], columns=1))

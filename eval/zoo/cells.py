@@ -51,8 +51,8 @@ class Cell:
         exposure: of its pictures.
         covered: (H, W) share of a pixel's rays that meet the shape.
         truth: (H, W, 3) linear.
-        lit: quality -> (H, W, 3) linear, what the surfels let through divided out; ``preview_oidn`` and
-            ``final_oidn`` too, where it is there.
+        lit: quality -> (H, W, 3) linear, what the surfels let through divided out; by denoisers too, as
+            ``preview_oidn``, where they are there.
         psnr: way -> dB of display values, those of the network among them.
     """
 
@@ -94,7 +94,7 @@ def measured(
     materials: Sequence[Material],
     lights: Sequence[Light],
     seed: int,
-    oidn: bool,
+    denoisers: Sequence[str],
     networks: Mapping[str, Network],
 ) -> Iterator[Cell]:
     """Cells of an individual: every material under every light, whose shadows are traced once.
@@ -104,7 +104,7 @@ def measured(
         materials: on it.
         lights: around it.
         seed: root of all random numbers.
-        oidn: whether Open Image Denoise is tried, in one cell of :data:`TRIED`.
+        denoisers: names of those that are tried, in one cell of :data:`TRIED`.
         networks: by name, tried there too.
     """
     start, first, baked = time.perf_counter(), None, dict[str, Illumination]()
@@ -116,7 +116,7 @@ def measured(
         first = first or Relighter(scene, PREVIEW, root, proxy=choice).prepare()
         relighter = first if scene is first.scene else first.changed(scene)
         meshes = [textured(part, f"part{n}").shape for n, part in enumerate(shape.of(material))]
-        albedo = relighter.surface_maps(shape.camera, *QUALITIES.values()) if oidn else []
+        maps = relighter.surface_maps(shape.camera, *QUALITIES.values()) if denoisers else []
         for place, light in enumerate(lights):
             tried = (number + place) % TRIED == 0
             names = ("zoo", shape.kind, shape.number, number, light.name)
@@ -133,8 +133,8 @@ def measured(
                 framed = replace(under, estimation=estimation)
                 traced = framed.trace(shape.camera, rays)
                 cell.lit[quality] = _whole(traced)
-                if oidn and tried:
-                    cell.lit[f"{quality}_oidn"] = _whole(traced.denoised(albedo[k]["albedo"]))
+                for name in denoisers if tried else ():
+                    cell.lit[f"{quality}_{name}"] = _whole(traced.denoised(name, maps[k]))
                 for name, network in networks.items() if tried else ():
                     cell.judge(f"{quality}_{name}", drawn(network, framed, [shape.camera], exposure, rays)[0])
             for way, image in cell.lit.items():

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from eval.relighting import baselines
-from eval.relighting.baselines import RATIO_FLOOR, show_oidn
+from eval.relighting.baselines import BASELINES, DENOISED, RATIO_FLOOR, show_denoised
 from eval.relighting.bilateral import BilateralFit, bilateral
 from eval.relighting.buffers import Buffers
 from eval.relighting.fits import (
@@ -23,6 +23,7 @@ from eval.relighting.fits import (
     show_product,
 )
 from tron.color import agx, to_display
+from tron.denoising import DENOISERS, Denoiser, installed
 from tron.seeds import generator
 
 
@@ -299,6 +300,19 @@ def test_a_blend_by_psnr_is_the_best_that_gradients_find():
 def test_open_image_denoise_takes_noise_away_where_it_is_installed():
     pytest.importorskip("pyoidn")
     lit = generator(3, "oidn").uniform(0.2, 0.6, (1, 32, 32, 3)).astype(np.float32)
-    shown = show_oidn(clip_of(lit))
+    shown = show_denoised(clip_of(lit), "oidn")
     assert shown.shape == lit.shape
     assert shown.std() < 0.5 * to_display(lit, 1.0).std()
+
+
+def test_a_denoiser_is_a_row_of_the_table_and_a_baseline(monkeypatch: pytest.MonkeyPatch):
+    assert DENOISED.keys() == DENOISERS.keys()
+    assert {each.name for each in DENOISED.values() if each in BASELINES} == {f"lit_{n}" for n in installed()}
+    halved = Denoiser(
+        "Half", "half of it", ("albedo",), "numpy", "", lambda: lambda lit, albedo: lit * albedo
+    )
+    monkeypatch.setitem(DENOISERS, "half", halved)
+    lit = generator(3, "half").uniform(0.2, 0.6, (2, 32, 32, 3)).astype(np.float32)
+    buffers = clip_of(lit)
+    expected = to_display(lit * buffers["albedo"], buffers.exposure)
+    np.testing.assert_allclose(show_denoised(buffers, "half"), expected, atol=1e-6)

@@ -1,12 +1,13 @@
 """Gains that tron-relight's checkpoint=auto goes by: of which clips, and how sure they are."""
 
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
-from eval.relighting.baselines import OIDN
+from eval.relighting.baselines import DENOISED
 from eval.relighting.buffers import Buffers
 from eval.relighting.networks import Network
 from eval.renderer import validation
@@ -42,8 +43,9 @@ def test_each_quality_is_judged_by_its_own_clips_over_lit(
 
     monkeypatch.setattr(validation, "read_clips", lambda *_: iter(clips))
     monkeypatch.setattr(Network, "show", show)
-    monkeypatch.setattr(validation, "BASELINES", (OIDN,))
-    monkeypatch.setattr(validation, "show_oidn", lambda buffers: half_way(by_lit[id(buffers["pbr"])]))
+    oidn = replace(DENOISED["oidn"], show=lambda buffers: half_way(by_lit[id(buffers["pbr"])]))
+    monkeypatch.setattr(validation, "DENOISED", {"oidn": oidn})
+    monkeypatch.setattr(validation, "BASELINES", (oidn,))
     network = Network(Path("none"), None)  # type: ignore[arg-type]
     rows = {row.metric: row for row in validation_rows(Path("none"), "test", network, 512, 0)}
     decibels = [-20 * np.log10(left) for left in CLOSER.values()]

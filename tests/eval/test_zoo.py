@@ -333,7 +333,7 @@ def test_a_ball_under_even_light_is_right_and_holes_are_not_its_lights(
     monkeypatch.setattr(zoo_cells, "EVEN_PATHS", 16)
     shape: Shape = draw_shape("ball", 0, 3)
     white, grey = GREY._replace(base_color=(1.0, 1.0, 1.0)), GREY
-    found = list(measured(shape, [white, grey], [even], 3, False, {}))
+    found = list(measured(shape, [white, grey], [even], 3, [], {}))
     for each in found:
         for quality in QUALITIES:
             assert each.mean(quality) == pytest.approx(1, abs=0.02)
@@ -354,7 +354,7 @@ def test_an_edge_mirrors_no_lamp_that_neither_of_its_faces_does(monkeypatch: pyt
     x, y, z = 2 * (mixed @ eye) * mixed - eye
     lamp = disc(np.degrees(np.arcsin(z)), np.degrees(np.arctan2(y, x)), 8.0)[..., None] * np.full(3, 100.0)
     light = Light("lamp", EnvironmentMap(lamp + 0.3))
-    (found,) = measured(shape, [Material("grey", (0.5, 0.5, 0.5), 0.1, 1.0)], [light], 3, False, {})
+    (found,) = measured(shape, [Material("grey", (0.5, 0.5, 0.5), 0.1, 1.0)], [light], 3, [], {})
     for quality in QUALITIES:
         assert found.mean(quality) == pytest.approx(1, abs=0.03)
 

@@ -79,7 +79,7 @@ MESHES = names(EXTRAS["models"]) - names(EXTRAS["datagen"])
 PEERS |= MESHES
 # Networks are loaded where a checkpoint is given; the extras `network` and `rgbx` are asked for then.
 ASKED_FOR = {
-    ("tron.apps.relight.command", "tron.neural.weights"),
+    ("tron.apps.relight.network", "tron.neural.weights"),
     ("tron.apps.relight.clip", "tron.neural.renderer"),
     ("tron.view.opening", "tron.neural.weights"),  # where the extra `network` is installed
     ("tron.view.finishing", "tron.neural.renderer"),

@@ -5,7 +5,8 @@ import sys
 import numpy as np
 import pytest
 
-from tron.denoising import LEAST_SIDE, denoised, require_oidn
+from tron.denoising import LEAST_SIDE, require
+from tron.denoising import denoised as by_name
 from tron.errors import TronError
 from tron.seeds import generator
 
@@ -13,6 +14,10 @@ from tron.seeds import generator
 @pytest.fixture
 def oidn() -> None:
     pytest.importorskip("pyoidn", reason="pip install 'tron-relight[oidn]'")
+
+
+def denoised(radiance: np.ndarray, albedo: np.ndarray) -> np.ndarray:
+    return by_name("oidn", radiance, {"albedo": albedo})
 
 
 def shaded(height: int = 64, width: int = 96) -> np.ndarray:
@@ -86,5 +91,5 @@ def test_a_value_that_is_no_number_is_one_pixel_and_is_told_of(oidn, caplog):
 def test_without_the_library_one_line_says_how_to_get_it(monkeypatch):
     monkeypatch.setitem(sys.modules, "pyoidn", None)
     with pytest.raises(TronError) as told:
-        require_oidn("denoise=oidn")
+        require("oidn", "denoise=oidn")
     assert str(told.value) == "denoise=oidn needs pyoidn: pip install 'tron-relight[oidn]'"

@@ -12,18 +12,14 @@ from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.scene_file import SURROUNDINGS, FoundMaterials, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
-from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.color import Look
 from tron.gaussians.formats.registry import WRITTEN
-from tron.gaussians.scene import GaussianScene
 from tron.gaussians.splat_files import check_count, check_suffix, write_splats
 from tron.runtime import Threads, Variant, activate
 from tron.scans import Scan
-from tron.scans.camera_files import filmed_orbit
 from tron.scans.surroundings import Treatment
-from tron.trajectories import plan_cameras
 
 log = logging.getLogger(__name__)
 
@@ -93,7 +89,8 @@ def main(settings: Settings) -> None:
     light = relighter.under(environment.rotated(settings.rotation))
     exposure = settings.exposure
     if exposure == "auto":
-        camera = _front(scan.content, scan.filmed)
+        fov_deg = scan.filmed[0].fov_deg if scan.filmed else 40.0
+        (camera,) = scan.film("still", 1, SIDE, SIDE, fov_deg)  # the first of tron-relight's orbit
         exposure = light.render(camera, settings.seed).exposure(settings.look)
         log.info(
             "exposure %.4g, metered; exposure=%.4g keeps it, twice as much is a stop brighter",
@@ -110,14 +107,6 @@ def main(settings: Settings) -> None:
             "harmonics of degree 3 hold nothing sharper", 100 * smooth, MIRRORING,
         )  # fmt: skip
     log.info("%d splats, for any 3DGS viewer: %s", len(lit), settings.output)
-
-
-def _front(scene: GaussianScene, filmed: list[Camera] | None) -> Camera:
-    """The first view of tron-relight's orbit, of a scene with z up."""
-    view = {"width": SIDE, "height": SIDE, "fov_deg": filmed[0].fov_deg if filmed else 40.0}
-    if filmed:
-        return filmed_orbit(filmed, 1, up=scene.up, distance=1.0, **view)[0]
-    return plan_cameras(scene, "orbit", 1, **view)[0]
 
 
 cli = command(

@@ -24,6 +24,7 @@ from pydantic import Field
 
 from tron.apps.frame_folder import FrameFolder
 from tron.color import Look, to_display
+from tron.denoising import DENOISERS
 
 Channel = Annotated[float, Field(ge=0, le=1)]
 Background = Literal["environment", "transparent"] | tuple[Channel, Channel, Channel]
@@ -37,13 +38,13 @@ class RelitPicture:
         background: behind the surfels: "environment", "transparent" or a display colour, see above.
         source: the picture of the surfels: a network's, or a buffer of guidance.
         look: of the picture (:data:`tron.color.LOOKS`).
-        denoised: whether the buffer is through Open Image Denoise.
+        denoiser: that the buffer goes through, if any (:mod:`tron.denoising`).
     """
 
     background: Background
     source: Literal["neural", "lit", "shadowed"]
     look: Look = "none"
-    denoised: bool = False
+    denoiser: str | None = None
 
     @property
     def neural(self) -> bool:
@@ -65,7 +66,7 @@ class RelitPicture:
             "lit": "light with its bounces (lit; no checkpoint)",
             "shadowed": "direct light alone (shadowed; no checkpoint)",
         }[self.source]
-        made += ", through Open Image Denoise" if self.denoised else ""
+        made += f", through {DENOISERS[self.denoiser].title}" if self.denoiser else ""
         behind = {"environment": "over the environment", "transparent": "with alpha"}
         shown = behind.get(str(self.background)) or f"over the colour {list(self.background)}"
         return f"relit pictures: {made}, {shown}"

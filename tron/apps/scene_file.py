@@ -68,14 +68,20 @@ def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
         TronError: it is not so.
     """
     for path in (scene, *read):
-        if path is not None and not path.is_file():
-            if path.is_dir():
-                refuse_by_sight(path, "this should be a file")
-                raise TronError("cannot read: is a folder", path, "give one file of it")
-            raise TronError("file not found", path)
+        if path is not None:
+            require_file(path)
     check_output(output, scene, "the scene")
     refuse_foreign(scene)
     check_header(scene)
+
+
+def require_file(path: Path, mend: str = "") -> None:
+    """TronError unless a file is there; ``mend``: what to do where nothing is."""
+    if path.is_dir():
+        refuse_by_sight(path, "this should be a file")
+        raise TronError("cannot read: is a folder", path, "give one file of it")
+    if not path.is_file():
+        raise TronError("file not found", path, mend)
 
 
 def check_output(output: Path, source: Path, what: str) -> None:

@@ -86,9 +86,16 @@ def require_extra(what: str, extra: str) -> None:
         what: command or setting that needs them, for the message.
         extra: of pyproject.toml, such as "train".
     """
+    if (error := lacks_extra(what, extra)) is not None:
+        raise error
+
+
+def lacks_extra(what: str, extra: str) -> TronError | None:
+    """The error of :func:`require_extra`, not raised; None where nothing is missing."""
     missing = missing_libraries(extra)
-    if missing:
-        raise TronError(f"{what} needs {', '.join(missing)}", mend=f"pip install '{DISTRIBUTION}[{extra}]'")
+    if not missing:
+        return None
+    return TronError(f"{what} needs {', '.join(missing)}", mend=f"pip install '{DISTRIBUTION}[{extra}]'")
 
 
 def missing_libraries(extra: str) -> list[str]:

@@ -15,11 +15,13 @@ from typing import Literal
 import numpy as np
 
 Quality = Literal["preview", "final"]
-Way = Literal["network", "oidn"]
-"""The shipped network, or Open Image Denoise; the third way is ``lit`` as it is."""
+Way = str
+""":data:`NETWORK`, or the name of a denoiser (:mod:`tron.denoising`); a third way is ``lit`` as it is."""
+NETWORK: Way = "network"
+"""The shipped one."""
 
 GAINS: Mapping[Way, Mapping[Quality, Mapping[int, float]]] = {
-    "network": {
+    NETWORK: {
         "preview": {128: 0.83, 256: 0.60, 512: 0.27},
         "final": {128: 0.22, 256: 0.29, 512: 0.29},
     },
@@ -47,6 +49,6 @@ def expected_gain(way: Way, quality: Quality, width: int, height: int) -> float:
 
 
 def best_first(ways: Iterable[Way], quality: Quality, width: int, height: int) -> dict[Way, float]:
-    """Ways -> what they gain at least, dB; the one that gains most comes first."""
-    gains: dict[Way, float] = {way: expected_gain(way, quality, width, height) for way in ways}
+    """Ways of which it is known -> what they gain at least, dB; the one that gains most comes first."""
+    gains = {way: expected_gain(way, quality, width, height) for way in ways if way in GAINS}
     return dict(sorted(gains.items(), key=lambda each: -each[1]))

@@ -17,12 +17,12 @@ surfels without a sign are turned to each of them.
 from __future__ import annotations
 
 import logging
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import drjit as dr
 import mitsuba as mi
@@ -462,7 +462,7 @@ class Illumination:
         seed: int | None = None,
         background: Sequence[float] | None = None,
         view: GBuffer | None = None,
-        denoise: Literal["oidn"] | None = None,
+        denoise: str | None = None,
     ) -> Guidance:
         """All buffers of one frame, linear.
 
@@ -471,11 +471,11 @@ class Illumination:
             seed: root of the random numbers of its rays; None: the relighter's ``frame_seed``, which is 0.
             background: linear RGB radiance behind the surfels; None: the environment.
             view: what the camera sees, where it is traced already (:func:`views_under`).
-            denoise: "oidn": as :meth:`TracedFrame.denoised`.
+            denoise: name of a denoiser: as :meth:`TracedFrame.denoised`.
         """
         frame = self.trace(camera, seed, view)
         if denoise is not None:
-            frame = frame.denoised(self.relighter.surface_maps(camera, self.estimation)[0]["albedo"])
+            frame = frame.denoised(denoise, self.relighter.surface_maps(camera, self.estimation)[0])
         return frame.shade(background)
 
 
@@ -508,20 +508,22 @@ class TracedFrame:
         colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.brdf)
         return self.view.images({name: colors[name] for name in names})
 
-    def denoised(self, albedo: np.ndarray) -> TracedFrame:
-        """The frame whose ``lit`` is through Open Image Denoise (:mod:`tron.denoising`).
+    def denoised(self, denoiser: str, maps: Mapping[str, np.ndarray]) -> TracedFrame:
+        """The frame whose ``lit`` is through a denoiser (:mod:`tron.denoising`).
 
         So is ``shadowed`` where nothing bounces; the other buffers are as they were, and so is what stands
         behind the surfels, which has no noise but for shadows on a ground.
 
         Args:
-            albedo: (H, W, 3) member of :func:`tron.shading.guidance.surface_maps` of the view.
+            denoiser: its name.
+            maps: (H, W, 3) each, :func:`tron.shading.guidance.surface_maps` of the view.
 
         Raises:
-            TronError: pyoidn is not there.
+            TronError: its library is not there.
         """
         over_black = replace(self, noise=None).shade((0, 0, 0))
-        noise = over_black.lit - denoised(over_black.lit, albedo)
+        guides = {**maps, "normal": over_black.gbuffer["normal"]}
+        noise = over_black.lit - denoised(denoiser, over_black.lit, guides)
         return replace(self, noise=np.where(over_black.mask[..., None] > 0, noise, 0))
 
 

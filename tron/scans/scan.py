@@ -26,10 +26,11 @@ from tron.gaussians.edit import subset
 from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate
-from tron.scans.camera_files import filmed_with
+from tron.scans.camera_files import filmed_orbit, filmed_with
 from tron.scans.materials import put_on, with_materials
 from tron.scans.surroundings import Surrounded, Treatment, treat_surroundings
 from tron.seeds import integer
+from tron.trajectories import TrajectoryName, plan_cameras
 
 if TYPE_CHECKING:
     from tron.models.parts import Part
@@ -154,6 +155,21 @@ class Scan:
     def filmed(self) -> list[Camera] | None:
         """Cameras that it was filmed with, upright; None where nothing tells."""
         return filmed_with(self.file, self.turn, self.offset, self.content)
+
+    def film(
+        self, path: TrajectoryName, frames: int, width: int, height: int, fov_deg: float,
+        distance: float = 1.0,
+    ) -> list[Camera]:  # fmt: skip
+        """Cameras of a path around it, upright; orbit and still lie between those it was filmed with, if any.
+
+        Args: as of :func:`tron.trajectories.plan_cameras`.
+        """
+        view = {"width": width, "height": height, "fov_deg": fov_deg, "distance": distance}
+        if self.filmed is None or path not in ("orbit", "still"):
+            return plan_cameras(self.content, path, frames, **view)
+        still = path == "still"
+        cameras = filmed_orbit(self.filmed, 1 if still else frames, up=self.content.up, **view)
+        return cameras * frames if still else cameras
 
     @property
     def _finds_materials(self) -> bool:

@@ -1,8 +1,8 @@
 """The last step of a picture at rest: what noise its passes have left is taken out.
 
-By a network that draws the picture of their buffers, or by Open Image Denoise. Both look at the whole
-picture, and give it up as soon as it is out of date: a network between two of its layers; Open Image Denoise,
-which cannot be interrupted, by leaving it to itself.
+By a network that draws the picture of their buffers, or by a denoiser. Both look at the whole picture, and
+give it up as soon as it is out of date: a network between two of its layers; a denoiser, which cannot be
+interrupted, by leaving it to itself.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Protocol, TypeVar
 import numpy as np
 
 from tron.color import from_agx
-from tron.denoising import denoised
+from tron.denoising import DENOISERS, denoised
 from tron.shards.schema import displayed
 
 if TYPE_CHECKING:
@@ -30,9 +30,11 @@ class Finish(Protocol):
 
     Attributes:
         buffers: of light that it is given besides ``lit``.
+        normals: whether it is given ``normal``, of unit length in the world.
     """
 
     buffers: tuple[str, ...]
+    normals: bool
 
     def __call__(
         self, frame: Mapping[str, np.ndarray], exposure: float, watch: Callable[[], None]
@@ -56,6 +58,7 @@ class Drawn:
     """
 
     buffers: tuple[str, ...] = ("pbr", "irradiance")
+    normals = False
 
     def __init__(self, loaded: Future[Renderer]) -> None:
         self._loaded = loaded
@@ -78,11 +81,12 @@ class Drawn:
 
 
 class Denoised:
-    """By Open Image Denoise, led by base color."""
+    """By a denoiser (:mod:`tron.denoising`), given by its name."""
 
     buffers: tuple[str, ...] = ()
 
-    def __init__(self) -> None:
+    def __init__(self, name: str) -> None:
+        self._name, self.normals = name, "normal" in DENOISERS[name].wants
         self._thread = ThreadPoolExecutor(1, "denoiser")
 
     def __call__(
@@ -90,7 +94,7 @@ class Denoised:
     ) -> np.ndarray:
         """As :class:`Finish` says; ``exposure`` plays no part."""
         del exposure
-        return _awaited(self._thread.submit(denoised, frame["lit"], frame["albedo"]), watch)
+        return _awaited(self._thread.submit(denoised, self._name, frame["lit"], frame), watch)
 
 
 def _awaited(soon: Future[T], watch: Callable[[], None]) -> T:

@@ -5,7 +5,6 @@ from __future__ import annotations
 import logging
 from collections.abc import Callable, Collection, Mapping
 from concurrent.futures import Future
-from importlib.util import find_spec
 from pathlib import Path
 from tempfile import mkdtemp
 from threading import Thread
@@ -13,12 +12,13 @@ from typing import TYPE_CHECKING
 
 import mitsuba as mi
 
+from tron import denoising
 from tron.cameras import Camera
 from tron.cli.installation import missing_libraries, require_extra
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.io.lights import LIGHT_SUFFIXES
-from tron.neural.network_gains import Way, best_first
+from tron.neural.network_gains import NETWORK, best_first
 from tron.neural.shipped import DEFAULT, checkpoint_file, installed
 from tron.relighting import Relighter
 from tron.runtime import activate, set_torch_threads, torch_device
@@ -84,21 +84,21 @@ def first_light(lights: Mapping[str, Path], wanted: str | None, own: Collection[
 def finish_of(threads: int | None) -> Callable[[int, int], Finish | None]:
     """What pictures at rest of a width and height are finished by.
 
-    As checkpoint=auto of tron-relight has it, by the network or Open Image Denoise, whichever surely gains
-    more. Where neither does Open Image Denoise, if installed, still takes the passes' noise out.
+    As checkpoint=auto of tron-relight has it, by the network or a denoiser, whichever surely gains more.
+    Where none does a denoiser, if installed, still takes the passes' noise out.
     """
-    drawn = denoised = None
+    drawn = None
     if not missing_libraries("network") and DEFAULT in installed():
         loaded: Future[Renderer] = Future()
         Thread(target=_load, args=(loaded, threads), daemon=True).start()
         drawn = Drawn(loaded)
-    if find_spec("pyoidn") is not None:
-        denoised = Denoised()
-    there: list[Way] = [*(["network"] if drawn else []), *(["oidn"] if denoised else [])]
+    denoisers = {name: Denoised(name) for name in denoising.installed()}
 
     def finish(width: int, height: int) -> Finish | None:
-        best, gain = next(iter(best_first(there, "final", width, height).items()), (None, 0.0))
-        return drawn if best == "network" and gain > 0 else denoised
+        gains = best_first([*([NETWORK] if drawn else []), *denoisers], "final", width, height)
+        if next(iter(gains), None) == NETWORK and gains[NETWORK] > 0:
+            return drawn
+        return next((denoisers[way] for way in (*gains, *denoisers) if way in denoisers), None)
 
     return finish
 

@@ -241,6 +241,8 @@ class Stage:
         for window in bands(part.camera):
             self._watch()
             maps.append(relighter.surface_maps(window, FINEST)[0])
+            if finish.normals:
+                maps[-1] = maps[-1] | {"normal": relighter.gbuffer(window).numpy()["normal"]}
         whole = {name: np.concatenate([each[name] for each in maps]) for name in maps[0]}
         exposure = self._lighting(part.light)[0].environment.exposure()
         return finish({**means, **whole}, exposure, self._watch)

@@ -6,6 +6,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from tron import denoising
 from tron.color import agx
 from tron.neural import network_gains
 from tron.neural.shipped import DEFAULT, installed
@@ -47,7 +48,7 @@ def finish(request) -> Drawn | Denoised:
     if request.param == "network":
         return Drawn(request.getfixturevalue("network"))
     pytest.importorskip("pyoidn")
-    return Denoised()
+    return Denoised("oidn")
 
 
 def idle() -> None:
@@ -108,12 +109,22 @@ def test_it_is_chosen_as_checkpoint_auto_chooses(monkeypatch):
     monkeypatch.setattr(network_gains, "GAINS", gains)
     monkeypatch.setattr(opening, "_load", lambda *_: None)
     monkeypatch.setattr(opening, "installed", lambda: {DEFAULT: None})
-    monkeypatch.setattr(opening, "find_spec", lambda _: True)
+    monkeypatch.setattr(denoising, "installed", lambda: ["oidn"])
     finish = opening.finish_of(None)
     assert isinstance(finish(128, 128), Denoised), "a loss where it is small"
     assert isinstance(finish(512, 512), Drawn)
     assert isinstance(finish(1024, 1024), Denoised), "the lesser gain"
-    monkeypatch.setattr(opening, "find_spec", lambda _: None)
+    half = denoising.Denoiser(
+        "Half", "half", ("normal",), "numpy", "", lambda: lambda lit, normal: lit * normal
+    )
+    monkeypatch.setitem(denoising.DENOISERS, "half", half)
+    monkeypatch.setattr(denoising, "installed", lambda: ["half"])
+    halves = opening.finish_of(None)(128, 128)
+    assert isinstance(halves, Denoised), "of unknown gains, and the only one"
+    assert halves.normals
+    frame = {"lit": np.ones((20, 20, 3)), "normal": np.full((20, 20, 3), 0.5)}
+    assert (halves(frame, 1.0, idle) == 0.5).all()
+    monkeypatch.setattr(denoising, "installed", list)
     assert opening.finish_of(None)(128, 128) is None
     monkeypatch.setattr(opening, "missing_libraries", lambda _: ["torch"])
     assert opening.finish_of(None)(512, 512) is None

@@ -14,20 +14,26 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+import tron
 from tron import seeds
 from tron.apps.frame_folder import FrameFolder
+from tron.apps.relight.settings import Settings
 from tron.apps.relit import RelitPicture, surfels_alone
 from tron.cameras import Camera
 from tron.cli.progress import track, working
 from tron.color import LOOKS, from_agx
-from tron.editing.motion import LightNow
+from tron.editing.motion import LightNow, Motion
 from tron.editing.moving import MovingScene
 from tron.errors import TronError
 from tron.flow import surface_motion
 from tron.io.images import write_image
 from tron.neural.clips import Overlap, averaged_frames
+from tron.runtime import describe_machine
+from tron.scans import Scan
+from tron.scans.camera_files import stated
 from tron.shards.schema import GUIDANCE, displayed, surface_members
 from tron.storage import write_atomic
+from tron.trajectories import turn_cameras
 
 if TYPE_CHECKING:
     from tron.neural.protocols import Renderer
@@ -40,7 +46,8 @@ log = logging.getLogger(__name__)
 
 DEPTH = "depth"
 """Buffer that the motion of surfaces is known by."""
-
+TOLD = ("kernel_degree", "spacing", "materials_guessed", "oriented", "projection")
+"""What relight.json says of a scene, beside the number of its surfels."""
 METERED = (
     "exposure %.4g, metered in the first frame; exposure=%.4g keeps it, twice as much is a stop brighter"
 )
@@ -77,6 +84,28 @@ class Clip:
     others: Mapping[Path, EnvironmentMap] = field(default_factory=dict)
     _prepared: tuple[tuple[Any, ...], Lighting] | None = None
     _baked: Illumination | None = None
+
+    @classmethod
+    def of(
+        cls, light: Settings, environment: EnvironmentMap, frames: int, guidance: Sequence[str],
+        averaged: bool,
+    ) -> Clip:  # fmt: skip
+        """The clip that settings of one light ask for; ``averaged``: along motion, by a network."""
+        picture = RelitPicture(light.background, light.source, light.look, light.denoiser)
+        needed = (*guidance, *picture.buffers, *light.buffers, *([DEPTH] if averaged else []))
+        buffers = tuple(dict.fromkeys(name for name in needed if name != "relit"))
+        return cls(
+            environment, light.rotations(frames), environment.exposure(), picture,
+            FrameFolder(light.output_dir / "frames", buffers), guidance, "relit" in light.buffers,
+            chosen=None if light.exposure == "auto" else light.exposure,
+        )  # fmt: skip
+
+    def follow(self, motion: Motion, fps: float, maps: Mapping[Path, EnvironmentMap]) -> None:
+        """Let the light change as a motion has it; ``maps``: all that it names, by their files."""
+        self.others = maps
+        self.lights = [motion.light_at(index / fps) for index in range(len(self.rotations))]
+        self.exposure = self.first_exposure()
+        self.rotations = [a + b.rotation for a, b in zip(self.rotations, self.lights)]
 
     def light(self, relighter: Relighter, index: int, now: Mapping[str, Any]) -> Illumination:
         """The environment as frame ``index`` has it, over what :meth:`Relighter.bring` is given ``now``."""
@@ -156,7 +185,7 @@ class Clip:
         """Write the neural renderer's pictures, as `render_frames` gives them.
 
         With cameras, one a frame, and the buffer DEPTH in the folder, ``reproject`` frames each are averaged
-        along their motion (`tron.apps.relight.command.averaged_frames_of` says how many).
+        along their motion (`tron.apps.relight.network.averaged_frames_of` says how many).
         """
         from tron.neural.renderer import render_frames
 
@@ -194,6 +223,34 @@ class Clip:
                 (output_dir / f"{name}.mp4").unlink(missing_ok=True)  # of an earlier run
         self.folder.write_sheet(output_dir / "contact_sheet.png", frames, ["relit", *self.guidance, *drawn])
 
+    def report(
+        self, light: Settings, scan: Scan, cameras: list[Camera], seconds: Mapping[str, float],
+        network: Mapping[str, Any] | None,
+    ) -> None:  # fmt: skip
+        """Write relight.json of the clip, with the seconds of the run's parts and the network's record."""
+        scene, file = scan.scene, light.output_dir / "relight.json"
+        said = {
+            "version": tron.__version__,
+            "settings": light.model_dump(mode="json"),
+            "relit": self.picture.source,
+            "scene": {"surfels": len(scene)} | {name: getattr(scene, name) for name in TOLD},
+            "exposure": self.shown_exposure,
+            "guidance_exposure": self.exposure,
+            "frames": len(cameras),
+            "frames_rendered": len(self.seconds),
+            "first_frame_seconds": self.seconds[0] if self.seconds else None,
+            "frame_seconds_median": float(np.median(self.seconds)) if self.seconds else None,
+            "seconds": seconds,
+            "machine": describe_machine(),
+            "rotations": list(self.rotations),
+            "cameras": [camera.to_dict() for camera in turn_cameras(cameras, scan.turn.T)],
+            "network": network,
+            **stated(scan.offset),
+        }
+        write_atomic(file, json.dumps(said, indent=1) + "\n")
+        made = len(cameras), len(self.seconds), file.with_name("relit.mp4")
+        log.info("frames: %d, rendered now: %d; look at %s", *made)
+
 
 def trace(
     relighter: Relighter,
@@ -201,7 +258,7 @@ def trace(
     clips: Sequence[Clip],
     seed: int,
     moving: MovingScene | None = None,
-    times: Sequence[float] = (),
+    fps: float = 24.0,
 ) -> None:
     """Trace the frames that are missing, and write the pictures of all.
 
@@ -210,7 +267,8 @@ def trace(
         cameras: one a frame.
         clips: one a light.
         seed: root of the random numbers; a frame's do not depend on the environment.
-        moving: the scene's motion, if it has one, and the seconds of each frame.
+        moving: the scene's motion, if it has one.
+        fps: frames a second.
     """
     for clip in clips:
         if lacking := clip.folder.lacking(len(cameras)):
@@ -224,7 +282,7 @@ def trace(
             if not clip.folder.finished(index) or not clip.metered:
                 started = time.perf_counter()
                 ray_seed = seeds.integer(seed, "relight", index)
-                light = scenes.under(clip, index, times[index] if times else 0.0)
+                light = scenes.under(clip, index, index / fps)
                 surfaces = surfaces or cache(
                     partial(light.relighter.surface_maps, camera, relighter.estimation)
                 )
@@ -272,8 +330,8 @@ def _shade(
 
     names = clip.folder.buffers
     frame = light.trace(camera, seed)
-    if clip.picture.denoised:
-        frame = frame.denoised(surfaces()[0]["albedo"])
+    if clip.picture.denoiser is not None:
+        frame = frame.denoised(clip.picture.denoiser, surfaces()[0])
     guidance = frame.shade()
     # The share is no linear function of opacity: a pixel has the mean of those of its sub-pixels.
     transmittance = 1 - frame.view.images({"opacity": frame.view.opacity})["opacity"]

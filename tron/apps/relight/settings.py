@@ -3,15 +3,19 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, Literal
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
+import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
+import tron
 from tron.apps.relit import Background
 from tron.apps.scene_file import GROUND, SURROUNDINGS, FoundMaterials, SeenAs, Up
 from tron.apps.splat_file import SceneFile
 from tron.color import Look
+from tron.denoising import DENOISERS, DenoiserName
 from tron.editing.models import PlacedModel
+from tron.editing.motion import Motion
 from tron.errors import TronError
 from tron.estimation import FINAL, QUALITY, Brdf, Estimation, Estimator, require_bounces
 from tron.io.cameras.registry import cameras_of
@@ -20,9 +24,10 @@ from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
 from tron.runtime import Variant
 from tron.scans.camera_files import CAMERAS, frame_size
-from tron.scans.scan import LIGHT, GroundChoice
+from tron.scans.scan import LIGHT, GroundChoice, is_of_capture
 from tron.scans.surroundings import Treatment
 from tron.shards.schema import guidance_members, light_members
+from tron.storage import sha256
 from tron.trajectories import TrajectoryName
 
 DEFAULT_BUFFERS = (*light_members(), "indirect", "foreground", "mask", "share", "depth")
@@ -40,6 +45,9 @@ LONGER_SIDE = 512
 
 ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
+T = TypeVar("T")
+DisplayOnly = Annotated[T, Field(json_schema_extra={"display_only": True})]
+"""A setting that no traced frame is made with: frames of a folder stay where it changes."""
 
 
 class Settings(BaseModel):
@@ -54,8 +62,8 @@ class Settings(BaseModel):
         "beside it; of several, [a.hdr,b.hdr], each has its own folder in output_dir, named after the file",
         examples=["[a.hdr,b.hdr]"],
     )
-    output_dir: Path = Field(description="folder for frames, videos and relight.json")
-    background: Background = Field(
+    output_dir: DisplayOnly[Path] = Field(description="folder for frames, videos and relight.json")
+    background: DisplayOnly[Background] = Field(
         "environment",
         description="what stands behind the surfels in the relit picture: the environment, nothing (PNG with "
         "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
@@ -133,11 +141,11 @@ class Settings(BaseModel):
         FINAL.two_sided,
         description="back faces block shadow rays beyond two spacings; false: never, as in the paper",
     )
-    denoise: bool | Literal["oidn"] = Field(
+    denoise: DenoiserName | bool = Field(
         True,
-        description="filter of the shadows' noise; false: as they are traced; oidn: filtered, and the relit "
-        "picture besides by Intel's Open Image Denoise, led by base color, in place of a network "
-        "(pip install 'tron-relight[oidn]')",
+        description="filter of the shadows' noise; false: as they are traced; or a denoiser of the relit "
+        "picture besides, in place of a network: "
+        + ", ".join(f"{name}, {row.title} ({row.mend})" for name, row in DENOISERS.items()),
     )
     frames: int = Field(
         60,
@@ -156,36 +164,36 @@ class Settings(BaseModel):
     )
     distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
-    exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
+    exposure: DisplayOnly[Literal["auto"] | Annotated[float, Field(gt=0)]] = Field(
         "auto",
         description="factor before the tone curve of the relit picture; auto: metered for the light that "
         "falls on the subject in the first frame, one for the clip, which the log says",
     )
-    look: Look = Field(
+    look: DisplayOnly[Look] = Field(
         "photograph",
         description="tone of the relit picture: AgX with the contrast that photographs have, or none",
     )
     up: Up = None
-    checkpoint: Path | None = Field(
+    checkpoint: DisplayOnly[Path | None] = Field(
         Path(AUTO),
         description="renderer.safetensors, or the name of a checkpoint that comes with the package "
-        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT}, or "
-        "denoise=oidn where it is installed, whichever surely makes the picture better, or neither, as the "
-        "log says; null: no network. A network wants pip install 'tron-relight[network]'",
+        f"({', '.join(SHIPPED)}): the relit picture is then the neural renderer's; auto: {DEFAULT}, or a "
+        "denoiser that is installed, whichever surely makes the picture better, or neither, as the log says; "
+        "null: no network. A network wants pip install 'tron-relight[network]'",
         examples=["paper"],
     )
-    window: int | None = Field(
+    window: DisplayOnly[int | None] = Field(
         None,
         ge=1,
         description="frames that the neural renderer sees at once, sliding by one; null: as the checkpoint "
         "says, which is 1 for those of the package",
     )
-    overlap: Overlap = Field(
+    overlap: DisplayOnly[Overlap] = Field(
         "anchor",
         description="which window draws a frame that lies in several: the one in whose middle it stands "
         "(anchor), the one that ends with it (newest), or the mean of all",
     )
-    reproject: int = Field(
+    reproject: DisplayOnly[int] = Field(
         5,
         ge=1,
         le=33,
@@ -193,22 +201,22 @@ class Settings(BaseModel):
         "overlap=newest), brought to it along the exact motion of surfaces, against flicker, unless the "
         "light turns; 1: itself",
     )
-    weights: dict[str, float] | None = Field(
+    weights: DisplayOnly[dict[str, float] | None] = Field(
         None,
         description="weights of the neural renderer's buffers, one for each; null: the checkpoint's own",
         examples=["{pbr: 0.3, irradiance: 0.7}"],
     )
-    vae: Path | None = Field(None, description="WAN 2.1 VAE, for checkpoints that were trained with it")
-    buffers: tuple[BufferName, ...] = Field(
+    vae: DisplayOnly[Path | None] = Field(None, description="WAN 2.1 VAE, for checkpoints trained with it")
+    buffers: DisplayOnly[tuple[BufferName, ...]] = Field(
         DEFAULT_BUFFERS,
         description=f"buffers written as EXR, of {', '.join(BUFFERS)}; relit is the relit picture before "
         "exposure (without checkpoint)",
         examples=["[pbr]"],
     )
-    overwrite: bool = Field(False, description="replace frames that were made with other settings")
+    overwrite: DisplayOnly[bool] = Field(False, description="replace frames made with other settings")
     seed: int = Field(0, description="root of all random numbers")
     variant: Variant = "llvm_ad_rgb"
-    threads: int | None = Field(None, ge=1, description="threads of renderer and network; null: all")
+    threads: DisplayOnly[int | None] = Field(None, ge=1, description="of renderer and network; null: all")
 
     @model_validator(mode="before")
     @classmethod
@@ -220,15 +228,6 @@ class Settings(BaseModel):
         found = [own if str(each) == "capture" else each for each in (given if several else [given])]
         return {**data, "environment": found if several else found[0]}
 
-    @model_validator(mode="after")
-    def _has_radiance(self) -> Settings:
-        if self.checkpoint is not None and "relit" in self.buffers and not self.takes_default:
-            raise ValueError(
-                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
-                "out of buffers, or take 'shadowed'"
-            )
-        return self
-
     @field_validator("weights")
     @classmethod
     def _weigh_something(cls, weights: dict[str, float] | None) -> dict[str, float] | None:
@@ -237,18 +236,19 @@ class Settings(BaseModel):
         return weights
 
     @model_validator(mode="after")
-    def _draws_what_it_tunes(self) -> Settings:
+    def _drawn_by_one(self) -> Settings:
+        asked = self.checkpoint is not None and not self.takes_default
+        if asked and "relit" in self.buffers:
+            raise ValueError(
+                "a network draws display values, so there is no relit.exr with a checkpoint: leave 'relit' "
+                "out of buffers, or take 'shadowed'"
+            )
+        if asked and self.denoiser is not None:
+            both = f"denoise={self.denoiser} and a checkpoint would both draw the picture"
+            raise ValueError(f"{both}: leave one of the two out")
         if self.tuned and self.checkpoint is None:
             what = f"{self.tuned[0]} is the neural renderer's"
             raise ValueError(f"{what}: give a checkpoint too, or leave it out")
-        return self
-
-    @model_validator(mode="after")
-    def _drawn_by_one(self) -> Settings:
-        if self.denoise == "oidn" and self.checkpoint is not None and not self.takes_default:
-            raise ValueError(
-                "denoise=oidn and a checkpoint would both draw the picture: leave one of the two out"
-            )
         return self
 
     @model_validator(mode="after")
@@ -267,6 +267,39 @@ class Settings(BaseModel):
         given = {name: value for name, value in said.items() if value is not None}
         return Estimation(**{**QUALITY[self.quality].model_dump(), **given})
 
+    def made_with(self, frames: int, up: np.ndarray) -> dict[str, Any]:
+        """Recipe of one light's frames as JSON values: all settings that are not :data:`DisplayOnly`.
+
+        Files count by what is in them, other settings by what they come to.
+
+        Args:
+            frames: their number.
+            up: (3,) unit, in the frame of the scene's file.
+        """
+        counted = {
+            name for name, field in type(self).model_fields.items()
+            if not (isinstance(extra := field.json_schema_extra, dict) and extra.get("display_only"))
+        }  # fmt: skip
+        made: dict[str, Any] = {}
+        for name, value in self.model_dump(mode="json", include=counted).items():
+            path = getattr(self, name)
+            made |= {f"{name}_sha256": sha256(path)} if isinstance(path, Path) else {name: value}
+        if self.motion is None:
+            del made["fps"]  # nothing knows of seconds
+        else:
+            made["motion_sha256"] = [made["motion_sha256"], *map(sha256, Motion.read(self.motion).maps)]
+        for model, said in zip(self.meshes, made["meshes"]):
+            del said["file"]
+            said["sha256"] = sha256(model.file)
+        if self.denoiser is None:
+            del made["denoise"]  # `filtered` says it
+        if (filmed := self.scene.with_name(CAMERAS)).is_file():
+            made["filmed_sha256"] = sha256(filmed)
+        if is_of_capture(self.light, self.scene):
+            made["turned_with_scene"] = True
+        decided = {"frames": frames, "up": [round(float(value), 6) for value in up]}
+        return made | decided | self.estimation().model_dump(mode="json") | {"version": tron.__version__}
+
     @property
     def tuned(self) -> list[str]:
         """Settings of the neural renderer that were chosen."""
@@ -277,6 +310,11 @@ class Settings(BaseModel):
             "reproject": self.reproject != 5,
         }
         return [name for name, given in chosen.items() if given]
+
+    @property
+    def denoiser(self) -> str | None:
+        """Name of the denoiser that the relit picture goes through."""
+        return None if isinstance(self.denoise, bool) else self.denoise
 
     @property
     def takes_default(self) -> bool:

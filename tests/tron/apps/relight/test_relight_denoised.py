@@ -6,7 +6,9 @@ import sys
 import numpy as np
 import pytest
 
+from tron.denoising import DENOISERS, Denoiser
 from tron.io.images import read_image
+from tron.neural import network_gains
 
 
 @pytest.fixture
@@ -27,7 +29,7 @@ def test_a_network_and_the_denoiser_are_one_too_many(relight, base, tmp_path, ca
     assert relight(*base, "denoise=oidn", "checkpoint=surfaces", out) == 2
     assert "would both draw the picture" in capsys.readouterr().err
     assert relight(*base, "denoise=intel", out) == 2
-    assert "'denoise" in capsys.readouterr().err
+    assert "true, false or a denoiser: oidn" in capsys.readouterr().err
 
 
 def test_the_relit_picture_alone_is_denoised(relight, base, tmp_path, capsys):
@@ -60,3 +62,38 @@ def test_the_default_checkpoint_gives_way(relight, base, tmp_path, caplog):
     assert "through Open Image Denoise" in caplog.text
     assert read_image(tmp_path / "frames" / "0000.relit.png", channels=4).shape[2] == 4
     assert not (tmp_path / "neural.mp4").exists()
+
+
+def test_a_rival_is_a_row(relight, base, tmp_path, monkeypatch, caplog):
+    """Half the light, darker where surfaces turn from up: the frame's own buffers say how much."""
+
+    def half(lit, normal, albedo):
+        return lit * 0.25 * (1 + normal[..., 2:]) * (albedo.max(-1, keepdims=True) > 0)
+
+    row = Denoiser("Half", "half of it", ("normal", "albedo"), "numpy", "pip install numpy", lambda: half)
+    monkeypatch.setitem(DENOISERS, "half", row)
+    base = [*base, "width=16", "height=16", "exposure=1", "buffers=[lit,normal,foreground,mask]"]
+    frames = {name: tmp_path / name / "frames" for name in ("raw", "half", "auto")}
+    gains = {"network": {"preview": {16: -1.0}}, "half": {"preview": {16: 0.5}}}
+    monkeypatch.setattr(network_gains, "GAINS", gains)
+    chosen = {"raw": "checkpoint=null", "half": "denoise=half", "auto": "checkpoint=auto"}
+    with caplog.at_level("INFO"):
+        for name, given in chosen.items():
+            assert relight(*base, given, f"output_dir={tmp_path / name}") == 0
+    assert "Half draws the pictures: +0.50 dB" in caplog.text
+    assert "through Half" in caplog.text
+    read = {
+        run: {
+            name: read_image(frames[run] / f"0000.{name}.exr")
+            for name in ("lit", "normal", "foreground", "mask")
+        }
+        for run in frames
+    }
+    solid = read["raw"]["mask"][..., 0] > 0.999
+    assert solid.sum() > 20
+    for run in ("half", "auto"):
+        expected = read["raw"]["lit"] * 0.25 * (1 + read["raw"]["normal"][..., 2:])
+        np.testing.assert_allclose(read[run]["lit"][solid], expected[solid], rtol=0.01, atol=1e-3)
+        np.testing.assert_array_equal(read[run]["normal"], read["raw"]["normal"])
+    report = json.loads((tmp_path / "auto" / "relight.json").read_text())
+    assert report["settings"]["denoise"] == "half"
