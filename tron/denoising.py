@@ -81,9 +81,20 @@ def installed() -> list[str]:
     return [name for name, row in DENOISERS.items() if find_spec(row.library)]
 
 
+def row_of(name: str) -> Denoiser:
+    """The row of a denoiser.
+
+    Raises:
+        TronError: there is none of that name.
+    """
+    if name not in DENOISERS:
+        raise TronError(f"no denoiser is called {name}", mend=f"give one of {', '.join(DENOISERS)}")
+    return DENOISERS[name]
+
+
 def lacking(name: str, what: str) -> TronError | None:
     """Why a denoiser does not run here, None: it does; ``what``: the setting that needs it, to be named."""
-    row = DENOISERS[name]
+    row = row_of(name)
     try:
         row.load()
     except ModuleNotFoundError:

@@ -60,7 +60,8 @@ def with_materials(
     found = _read(path, len(content))
     if found is None and not find:
         log.warning(
-            "%s has no materials: they are guessed from its colours; materials=auto finds them, in minutes",
+            "%s has no materials: they are guessed from its colours until they are found, in minutes: by "
+            "materials=auto, or a button of tron-view",
             kept.scan,
         )
         return scene

@@ -71,15 +71,21 @@ class Response:
     specular: mi.Color3f
 
     @classmethod
-    def of(cls, surface: Surface, split_sum: SplitSum, brdf: Brdf) -> Response:
-        """The response along the surface's own rays; differentiable by material, normal and light."""
+    def of(
+        cls, surface: Surface, split_sum: SplitSum, brdf: Brdf, looked_up: Surface | None = None
+    ) -> Response:
+        """The response along the surface's own rays; differentiable by material, normal and light.
+
+        ``looked_up``: the same of another roughness, by whose lobe light is looked up; None: by its own.
+        """
         normal, to_camera = shading_normal(surface), -surface.direction
         cosine = dr.dot(normal, to_camera)
         share = reflectance(surface, split_sum.brdf, cosine, brdf)
+        seen = surface if looked_up is None else looked_up
         if brdf == "lambert":  # as the paper looks it up
-            mirrored = split_sum.reflected(normal, to_camera, surface.roughness)
+            mirrored = split_sum.reflected(normal, to_camera, seen.roughness)
         else:
-            mirrored = split_sum.averaged(lobe_parts(surface, split_sum.brdf, normal, to_camera))
+            mirrored = split_sum.averaged(lobe_parts(seen, split_sum.brdf, normal, to_camera))
         return cls(share.diffuse, share.specular, split_sum.diffuse(normal), mirrored * share.specular)
 
     def open(self) -> mi.Color3f:

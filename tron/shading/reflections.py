@@ -24,7 +24,7 @@ lobe goes on; what that meets has the bake's light alone.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING
 
 import drjit as dr
@@ -55,9 +55,9 @@ SMOOTHEST = 0.02
 EVEN = (0.6, 0.9)
 """Roughness up to which a metal that is met sends a ray on, and from which on bounced light is as good."""
 ROUGHER = 0.5
-"""Share of a lobe's alpha that what it meets has besides its own. A few rays of a rough floor seldom find the
-sun in a polished ball, and are white specks where they do (Kaplanyan and Dachsbacher 2013, "Path Space
-Regularization for Holistic and Robust Light Transport")."""
+"""Share of a lobe's alpha by which what it meets looks the environment up more roughly. A few rays of a rough
+floor seldom find the sun in a polished ball, and are white specks where they do (Kaplanyan and Dachsbacher
+2013, "Path Space Regularization for Holistic and Robust Light Transport")."""
 ROUGH = 0.2
 """Roughness from which on neighbours' rays count in full; a mirror keeps its own."""
 UNLIKE = 10.0
@@ -247,7 +247,7 @@ def _returned(
     """Radiance that what is met sends back along ``direction``; 0 where nothing is.
 
     ``seeds``: of the rays that metals which are met send on; None: they send none. ``wide``: alpha of the
-    lobe that the ray is of, by which what is met is rougher (:data:`ROUGHER`); None: it is not.
+    lobe that the ray is of (:data:`ROUGHER`); None: the environment is looked up as what is met is.
     """
     met = hit.surfel != NOTHING
     front = met & hit.front
@@ -257,11 +257,12 @@ def _returned(
 
     surface = centres(tracer.records, hit.surfel, front)
     surface.direction = direction
+    looked_up = surface
     if wide is not None:
         alpha = dr.hypot(dr.square(surface.roughness), ROUGHER * wide)
-        surface.roughness = dr.minimum(dr.sqrt(alpha), 1)
+        looked_up = replace(surface, roughness=dr.minimum(dr.sqrt(alpha), 1))
     direct, indirect = of(bounce.direct, front), of(bounce.indirect, front)
-    response = Response.of(surface, lighting.split_sum, brdf)
+    response = Response.of(surface, lighting.split_sum, brdf, looked_up)
     openness = dr.gather(mi.Float, bounce.openness, hit.surfel, front)
     visibility = ratio(direct, response.unshadowed, 1)
     bounced = evenly_bounced(indirect, openness, visibility, surface.roughness, response)

@@ -60,7 +60,7 @@ class MaterialSearch:
         given = {"file": str(self.file), "opened": opened, "variant": self.variant, "threads": self.threads}
         # No fork beside Dr.Jit's threads; and a spawned process would run a caller's script once more.
         self._process = subprocess.Popen(
-            [sys.executable, "-m", __name__, json.dumps(given, default=str)],
+            [sys.executable, "-P", "-m", __name__, json.dumps(given, default=str)],
             stdout=subprocess.PIPE, text=True,
             env=os.environ | {"PYTHONPATH": os.pathsep.join(path for path in sys.path if path)},
         )  # fmt: skip
@@ -86,7 +86,10 @@ class MaterialSearch:
         with process:
             assert process.stdout is not None
             for line in process.stdout:
-                about, share = json.loads(line)
+                try:
+                    about, share = json.loads(line)
+                except ValueError:  # what a library prints while it is imported
+                    continue
                 if share is None:
                     why = about
                 else:
@@ -97,7 +100,8 @@ class MaterialSearch:
 def search(file: str, opened: dict[str, Any], variant: str, threads: int | None) -> None:
     """In the process: find, keep, and say how far it is; at last why nothing was found."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is the window's, which ends this
-    os.nice(LEAST_PRIORITY)
+    if hasattr(os, "nice"):
+        os.nice(LEAST_PRIORITY)
     words = os.fdopen(os.dup(sys.stdout.fileno()), "w")
     os.dup2(sys.stderr.fileno(), sys.stdout.fileno())  # what libraries print is no word of ours
 
@@ -115,8 +119,11 @@ def search(file: str, opened: dict[str, Any], variant: str, threads: int | None)
     try:
         activate(variant, threads)
         scan = Scan.open(file, **opened, materials="auto", track=track, key="")
-        guessed = scan.scene.materials_guessed
-        why = "they cannot be told from this scan; the terminal says why" if guessed else ""
+        why = ""
+        if scan.scene.materials_guessed:
+            why = "they cannot be told from this scan; the terminal says why"
+        elif Scan.open(file, **opened, materials="kept", key="").scene.materials_guessed:
+            why = "they cannot be kept, neither beside the scan nor in output_dir"
     except Exception as error:
         why = str(error) or type(error).__name__
     say(why, None)

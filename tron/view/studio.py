@@ -130,7 +130,8 @@ class Studio:
         self._make: Callable[..., Stage] = lambda scene, about: Stage(
             scene, lights, home, seed, self._watch, busy, about
         )
-        self._of: Opener | None = lambda: (scene, about)  # what is to be opened
+        self._first = scene, about
+        self._of: Opener | None = None  # what is to be opened instead
         self._machine = variant, threads
         self._show, self._notice, self._finish, self._busy = show, notice, finish, busy
         self._changed = threading.Condition()
@@ -207,8 +208,8 @@ class Studio:
             self._of, self._refused = of, None
             self._version += 1
             self._wishes += 1
-            for view in self._views.values():
-                view.level = 0
+            # New ones: what is being drawn of the scene before is of none of them.
+            self._views = {n: _View(v.camera, scale=v.scale, drawn=v.drawn) for n, v in self._views.items()}
             self._changed.notify()
 
     def close(self) -> None:
@@ -247,26 +248,32 @@ class Studio:
                 rough = time.perf_counter() - self._moved < REST_SECONDS
             try:
                 with _ONE_AT_A_TIME:
-                    if of is not None:
+                    if stage is None:
                         activate(*self._machine)
-                        stage = self._make(*of())
-                        self._opened(of)
-                    assert stage is not None
+                        stage = self._make(*self._first)
+                    if of is not None:
+                        stage = self._other(of, stage)
                     self._work(stage, wish, number, rough)
             except _Outdated:
                 pass
             except Exception as error:
-                if stage is not None:  # what was shown goes on
-                    self._opened(of)
                 if not isinstance(error, TronError):
                     log.exception("drawing failed")
                 self._refuse(wish, number, str(error) or type(error).__name__)
 
-    def _opened(self, of: Callable[..., Any] | None) -> None:
-        """A scene is there, or cannot be opened; another may have come meanwhile."""
-        with self._changed:
-            if self._of is of:
-                self._of = None
+    def _other(self, of: Opener, stage: Stage) -> Stage:
+        """A stage of another scene; where it cannot be opened that is said, and the one before goes on."""
+        try:
+            return self._make(*of())
+        except Exception as error:
+            if not isinstance(error, TronError):
+                log.exception("opening a scene failed")
+            self._notice(str(error) or type(error).__name__)
+            return stage
+        finally:
+            with self._changed:
+                if self._of is of:  # another may have come meanwhile
+                    self._of = None
 
     def _wait(self) -> None:
         """Until there is something to do; holds the lock."""

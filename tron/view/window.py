@@ -55,7 +55,7 @@ ABOVE = 4.0
 EVERYWHERE = "0.0.0.0"
 """Host that stands for all addresses of the machine."""
 GUESSED = "*Materials are guessed from the scan's colours, which keep the light of its capture.*"
-FOUND = "*Materials were found and are kept beside the scan.*"
+FOUND = "*Materials were found, and are kept.*"
 BRAND = (232, 150, 60)
 
 
@@ -165,12 +165,12 @@ class Window:
 
     def close(self) -> None:
         """End the search, the studio's thread, then the server."""
-        if self._search is not None:
-            self._search.close()
-        self.studio.close()
         with self._pictures:
             self._closed = True
             self._pictures.notify_all()
+        if self._search is not None:
+            self._search.close()
+        self.studio.close()
         with redirect_stdout(io.StringIO()):
             self._server.stop()
 
@@ -255,11 +255,14 @@ class Window:
 
     def _find(self) -> None:
         """Look for materials, beside the window, and show them when they are there."""
-        if self._search is None or self._finder.disabled:
+        if self._search is None or self._finder.disabled or self._closed:
             return
         self._finder.disabled = True
         self._materials.content = "*Finding materials …*"
-        self._search.begin(self._finding, self._found)
+        try:
+            self._search.begin(self._finding, self._found)
+        except OSError as error:  # no process
+            self._found(str(error))
 
     def _finding(self, about: str, share: float) -> None:
         self._materials.content = f"*Finding materials: {about} · {share:.0%}*"
@@ -274,6 +277,8 @@ class Window:
         self._finder.remove()
         self._materials.content = FOUND
         self.studio.reopen(self._search.reopened)
+        with self._pictures:
+            self._last.clear()  # they are of guessed ones
 
     def _choose_light(self) -> None:
         self._want(light=self._light.value)

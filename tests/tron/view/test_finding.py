@@ -14,6 +14,7 @@ from tron.editing import Material, Move, Selection
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.view.finding import MaterialSearch
+from tron.view.stage import Stage
 from tron.view.window import FOUND, Window
 
 PATIENCE = 900
@@ -53,6 +54,35 @@ def test_a_scene_that_cannot_be_opened_is_a_notice_and_the_one_before_goes_on(op
         studio.wish(light="west")
         shown.final(studio, camera)
     assert shown.notices == ["there is no such file"]
+
+
+def test_what_is_drawn_of_the_scene_before_is_no_picture_of_the_other(
+    open_studio, scene, camera, monkeypatch
+):
+    """Also where the last piece of a picture was under way when the other scene came."""
+    other = replace(scene, base_color=np.clip(1 - scene.base_color, 0, 1))
+    display, came = Stage.display, threading.Event()
+    with open_studio(threads=1) as (studio, shown):
+
+        def shown_late(stage, *given):
+            image = display(stage, *given)
+            if not came.is_set():
+                came.set()
+                studio.reopen(lambda: (other, None))
+            return image
+
+        monkeypatch.setattr(Stage, "display", shown_late)
+        studio.wish(quality="preview")
+        studio.look(0, camera)
+        shown.until(lambda: shown.pictures and shown.pictures[-1].refined == 1)
+        found = studio.ask(lambda stage: stage.session.scene).result(60)
+        last = shown.pictures[-1].image
+    with open_studio(scene=other, threads=1) as (fresh, there):
+        fresh.wish(quality="preview")
+        fresh.look(0, camera)
+        there.until(lambda: there.pictures and there.pictures[-1].refined == 1)
+    assert found is other
+    np.testing.assert_array_equal(last, there.pictures[-1].image)
 
 
 def plain(scene: GaussianScene, file: Path) -> Path:

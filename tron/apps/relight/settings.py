@@ -284,9 +284,9 @@ class Settings(BaseModel):
         for name, value in self.model_dump(mode="json", include=counted).items():
             path = getattr(self, name)
             made |= {f"{name}_sha256": sha256(path)} if isinstance(path, Path) else {name: value}
-        if self.motion is None:
+        if self.motion is None and self.cameras is None:
             del made["fps"]  # nothing knows of seconds
-        else:
+        if self.motion is not None:
             made["motion_sha256"] = [made["motion_sha256"], *map(sha256, Motion.read(self.motion).maps)]
         for model, said in zip(self.meshes, made["meshes"]):
             del said["file"]

@@ -17,9 +17,9 @@ chromaticity, and with how many points face the same way. They are drawn anew af
 never a variable, so there is nothing to alternate.
 
 log L is a sum of cubemaps of 1, 2, 4, ... texels a face edge, luminance and two chromas apart. Priors, each
-with its weight: the 95th percentile of base color is ``brightest``, as few surfaces reflect more (what
-bounces says it too, but weakly); fine levels are small, colours grey, directions that no point looks into
-dark, and those that photos show are as they show them.
+with its weight: the 95th percentile of base color is ``brightest``, as few surfaces reflect more (``scale``;
+what bounces says it too, but weakly); fine levels are small, colours grey (``grey``), directions that no
+point looks into dark, and those that photos show are as they show them.
 """
 
 from __future__ import annotations
@@ -51,9 +51,8 @@ ROBUST = 0.2
 """Log difference beyond which a pair is doubted."""
 ALIKE = 0.12
 """Log chromaticity that like materials differ by."""
-_SCALE, _SMOOTH, _GREY, _DARK, _SKY = 0.05, 3e-3, 0.05, 0.02, 0.5
-"""Weights of the priors: brightness of base color, small fine levels, grey light, dark unseen directions, and
-the sky as the photos show it."""
+_SMOOTH, _DARK, _SKY = 3e-3, 0.02, 0.5
+"""Weights of other priors: small fine levels, dark unseen directions, and the sky as the photos show it."""
 _DARKNESS = 0.3  # radiance of unseen directions, as a share of the mean
 _PERCENTILE = 95
 _TURN = 0.01  # share of the scene's size that opposite normals count in the distance between points
@@ -78,6 +77,8 @@ class LightSettings(Settings):
     brightest: float = Field(
         default=0.8, gt=0, le=1, description="Base color of the 95th percentile, largest channel."
     )
+    scale: float = Field(default=0.05, ge=0, description="Weight of base color being as bright as that.")
+    grey: float = Field(default=0.05, ge=0, description="Weight of the light being grey.")
 
 
 @dataclass(frozen=True)
@@ -148,7 +149,7 @@ def fit_light(
 
     Args:
         points: at least ten, all of them seen.
-        settings: sizes and steps.
+        settings: sizes, steps, and the weights that are chosen.
         seed: root of the pairs.
         sky: radiance of the cubemap's directions as the photos show it; None: they show none.
         begin: light whose sun to begin with.
@@ -258,10 +259,10 @@ class _Fit:
         off = (base[:, None] - base.index_select(0, self.partner).view(*self.weight.shape[:2], 3)).abs()
         loss = (self.weight * ROBUST * torch.log1p(off / ROBUST)).sum()
         loss = loss + _SMOOTH * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
-        loss = loss + _GREY * sum(_coloured(z) for z in self.chroma[1:])
-        loss = loss + _GREY * 0.05 * _coloured(self.chroma[0])
+        loss = loss + self.settings.grey * sum(_coloured(z) for z in self.chroma[1:])
+        loss = loss + self.settings.grey * 0.05 * _coloured(self.chroma[0])
         bright = torch.quantile(base.amax(1), _PERCENTILE / 100)
-        loss = loss + _SCALE * (bright - float(np.log(self.settings.brightest))) ** 2
+        loss = loss + self.settings.scale * (bright - float(np.log(self.settings.brightest))) ** 2
         brightness = light.mean(1)
         mean = torch.log(torch.exp(brightness).mean()).detach()
         above = (brightness - mean - float(np.log(_DARKNESS))) ** 2

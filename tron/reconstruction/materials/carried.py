@@ -32,7 +32,7 @@ from tron.gaussians.harmonics import dc_to_rgb
 from tron.gaussians.neighbours import alike_neighbours
 from tron.gaussians.scene import GaussianScene
 from tron.metrics import capped_psnr
-from tron.reconstruction.light.fit_pairs import TooFewSeen
+from tron.reconstruction.light.fit_pairs import LightSettings, TooFewSeen
 from tron.reconstruction.materials.joint_fit import JointFit, JointSettings, fit_jointly
 from tron.reconstruction.progress import Track, untracked
 from tron.relighting import Relighter
@@ -92,7 +92,7 @@ def carry_materials(
     """
     scan = capture.scan
     assert scan is not None
-    light = settings.light.model_copy(update={"scale": _SCALE, "grey": _GREY})
+    light = LightSettings(**settings.light.model_dump() | {"scale": _SCALE, "grey": _GREY})
     held = settings.model_copy(update={"light": light, "same_exposure": True, "neutral": True})
     found = by_proxy(capture, scan, held, seed, track)
     if found is None:

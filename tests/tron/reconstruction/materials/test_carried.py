@@ -15,7 +15,9 @@ from tron.color import linear_to_srgb, srgb_to_linear
 from tron.gaussians.harmonics import dc_to_rgb, rgb_to_dc
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction.film import film, film_of_scan
+from tron.reconstruction.light.fit_pairs import LightSettings
 from tron.reconstruction.light.surfel_colors import SurfelColors
+from tron.reconstruction.materials import carried
 from tron.reconstruction.materials.carried import Carried, carry, carry_materials
 from tron.reconstruction.materials.joint_fit import JointFit, JointSettings, fit_jointly
 from tron.reconstruction.priors.joint import Joint
@@ -186,6 +188,21 @@ def quality(found: np.ndarray, truth: np.ndarray) -> float:
     """PSNR, dB, of base color after one factor."""
     factor = (found * truth).sum() / (found**2).sum()
     return float(-10 * np.log10(((factor * found - truth) ** 2).mean()))
+
+
+def test_the_light_of_a_scan_is_fitted_with_weights_of_its_own(
+    variant, painted: GaussianScene, monkeypatch
+) -> None:
+    """Ten to twenty times those of photographs: else base color runs beyond 1, and light takes its colours."""
+    held: list[JointSettings] = []
+    monkeypatch.setattr(carried, "by_proxy", lambda capture, scan, settings, *_: held.append(settings))
+    capture = Capture(tuple(film(painted, film_around(painted, 2, 16))), scan=painted)
+    assert carry_materials(capture, JointSettings(), 0) is None
+    (light,) = [settings.light for settings in held]
+    usual = LightSettings()
+    assert light.scale == pytest.approx(20 * usual.scale)
+    assert light.grey == pytest.approx(10 * usual.grey)
+    assert light.resolution == usual.resolution
 
 
 @pytest.mark.long
