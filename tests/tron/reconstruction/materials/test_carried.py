@@ -193,7 +193,7 @@ def quality(found: np.ndarray, truth: np.ndarray) -> float:
 def test_the_light_of_a_scan_is_fitted_with_weights_of_its_own(
     variant, painted: GaussianScene, monkeypatch
 ) -> None:
-    """Ten to twenty times those of photographs: else base color runs beyond 1, and light takes its colours."""
+    """Ten to twenty times those of photographs: else base color runs beyond 1, and light takes its hue."""
     held: list[JointSettings] = []
     monkeypatch.setattr(carried, "by_proxy", lambda capture, scan, settings, *_: held.append(settings))
     capture = Capture(tuple(film(painted, film_around(painted, 2, 16))), scan=painted)
