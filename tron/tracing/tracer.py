@@ -263,4 +263,4 @@ def trace_rays(
 
         hits = RelistedHits(still, search_lanes, along, ray, sums.count)
         sums = attach(sums, records, at, direction, [hits])
-    return surface(sums, still, at, along)
+    return surface(sums, records, at, along)
