@@ -290,6 +290,7 @@ class Finish:
     """A grey picture; it begins, and waits as long as it is told to."""
 
     buffers = ("pbr",)
+    normals = False
 
     def __init__(self) -> None:
         self.frames, self.begun, self.slow = [], threading.Event(), False
@@ -349,7 +350,7 @@ def test_a_finish_that_fails_leaves_the_passes_as_they_are(open_studio, camera, 
     def broken(frame, exposure, watch):
         raise OSError("no such library")
 
-    broken.buffers = ()
+    broken.buffers, broken.normals = (), False
     with open_studio() as (studio, shown):
         studio.look(0, camera)
         plain = shown.final(studio, camera).image
