@@ -8,7 +8,7 @@ from pathlib import Path
 
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {
-    "tron": (2_950, 18),
+    "tron": (2_960, 18),
     "tron/apps": (3_500, 22),
     "tron/brdf": (800, 7),
     "tron/captures": (5_150, 34),
@@ -27,7 +27,7 @@ CODE = {
     "tron/shading": (4_840, 24),
     "tron/shards": (1_980, 10),
     "tron/tracing": (4_770, 23),
-    "tron/view": (2_650, 13),
+    "tron/view": (2_660, 13),
     "conf": (50, 12),
     "datagen": (20_050, 129),
     "train": (3_290, 22),
@@ -44,7 +44,7 @@ TESTS = {
     "tests/robustness": 2_500,
     "tests/slurm": 300,
     "tests/train": 3_260,
-    "tests/tron": 33_300,
+    "tests/tron": 33_350,
 }
 """Tests of a package -> their lines."""
 MOST_ROOM = 2_000
