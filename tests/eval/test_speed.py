@@ -22,6 +22,7 @@ def run(*arguments: str) -> int:
     return end.value.code  # type: ignore[return-value]
 
 
+@pytest.mark.long
 def test_every_way_is_timed_at_every_size_and_after_every_edit(weights: Path, tmp_path: Path):
     pair, lit = weights / "tiny_of_two.safetensors", weights / "tiny.safetensors"
     toy = ["sizes=[16]", "edit_size=16", "network_sizes=[16]", "rounds=1", f"surfels={SURFELS}"]

@@ -172,7 +172,7 @@ def lit(surrounded, camera):
 
 @pytest.mark.parametrize(
     "position",
-    [(3, -3, 3), pytest.param((40, -40, 30), marks=pytest.mark.long)],
+    [pytest.param((3, -3, 3), marks=pytest.mark.long), pytest.param((40, -40, 30), marks=pytest.mark.long)],
     ids=["inside", "outside"],
 )
 def test_what_surrounds_is_in_no_light_s_way(domed, position, tmp_path):

@@ -34,7 +34,7 @@ from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 from tron.storage import locked
 
-pytestmark = pytest.mark.usefixtures("variant")
+pytestmark = [pytest.mark.usefixtures("variant"), pytest.mark.long]
 
 TINY = [
     "experiment=pseudo_captures",

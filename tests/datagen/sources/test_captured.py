@@ -48,6 +48,8 @@ Recipe = Callable[..., Settings]
 SOURCE = SOURCES["captured"]
 CAMERA = Camera.look_at((0, -3, 1), (0, 0, 0), fov_deg=40, width=12, height=8)
 
+pytestmark = pytest.mark.long
+
 
 def settings_of(*overrides: str) -> Settings:
     return check(compose_recipe("conf.datagen", Settings, overrides), Settings)

@@ -83,6 +83,7 @@ def test_a_fit_repeats_bit_by_bit(spooled, one_thread) -> None:
     assert first.means.tobytes() != another.means.tobytes()
 
 
+@pytest.mark.long
 def test_windows_gain_more_than_whole_views_of_as_many_pixels(spooled, one_thread, monkeypatch) -> None:
     surfels, seen, others = spooled
     after, pixels, whole = [], [], training.render

@@ -228,7 +228,7 @@ STEP = 0.001
 """Small: lookups are linear between texels, levels and the table's nodes. Sums are in float64 therefore."""
 
 
-@pytest.mark.parametrize("buffer", ["pbr", "lit"])
+@pytest.mark.parametrize("buffer", [pytest.param("pbr", marks=pytest.mark.long), "lit"])
 def test_gradients_of_materials_are_the_finite_differences(surfels, light, buffer: str) -> None:
     """Of lit also through the light that surfels send to one another; shadow rays are the same for both."""
     integrator, scene = plugin(surfels, buffer=buffer), scene_of(light.to_mitsuba())

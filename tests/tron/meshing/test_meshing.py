@@ -44,7 +44,7 @@ def ball(radius: float = RADIUS, middle: np.ndarray = MIDDLE, surfels: int = 600
 
 
 @pytest.mark.usefixtures("variant")
-@pytest.mark.parametrize("together", [None, 500])
+@pytest.mark.parametrize("together", [pytest.param(None, marks=pytest.mark.long), 500])
 def test_a_ball_is_a_ball_with_its_paint(tmp_path: Path, monkeypatch, together: int | None) -> None:
     """Whether it is cut whole, or piece by piece: charts of several pieces would paint over one another."""
     if together is not None:

@@ -305,7 +305,10 @@ def lobe_in_float64(view: np.ndarray, out: np.ndarray, alpha: float, f0: float) 
 
 
 @pytest.mark.parametrize("metallic", [1.0, 0.0])
-@pytest.mark.parametrize("roughness", [0.25, 0.45, 0.8])
+@pytest.mark.parametrize(
+    "roughness",
+    [pytest.param(0.25, marks=pytest.mark.long), 0.45, pytest.param(0.8, marks=pytest.mark.long)],
+)
 def test_lobes_seen_aslant_are_looked_up_as_long_as_they_are(
     variant: str, material, roughness: float, metallic: float
 ) -> None:

@@ -313,6 +313,7 @@ def test_motion_by_the_traced_depth_is_where_the_traced_position_is_seen(
     np.testing.assert_allclose(motion.displacement[solid], expected, atol=1e-2)
 
 
+@pytest.mark.long
 def test_cameras_of_a_report_repeat_its_frames(relight, scene_path, light_path, tmp_path):
     base = [f"scene={scene_path}", f"environment={light_path}", "up=[0,1,1]", "frames=2"]
     assert relight(*base, f"output_dir={tmp_path / 'a'}") == 0

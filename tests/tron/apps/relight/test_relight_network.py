@@ -56,6 +56,7 @@ def pictures(out, name: str = "relit") -> np.ndarray:
     return np.stack([read_image(out / "frames" / f"{index:04d}.{name}.png") for index in range(3)])
 
 
+@pytest.mark.long
 def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, checkpoints, tmp_path):
     path, drawn = checkpoints / "paper.safetensors", {}
     choices = {
@@ -84,6 +85,7 @@ def test_window_overlap_and_weights_change_the_pictures_and_are_on_record(run, c
         assert np.abs(drawn[name] - drawn["plain"]).max() > 2 / 255
 
 
+@pytest.mark.long
 def test_frames_of_an_older_run_that_lack_a_buffer_are_traced_again_with_a_line(
     run, checkpoints, tmp_path, caplog
 ):

@@ -139,6 +139,7 @@ def test_single_frames_never_move_the_ends_of_the_paths():
     assert all(not p.any() for p in ends)
 
 
+@pytest.mark.long
 def test_one_batch_can_be_learnt_by_heart():
     torch.manual_seed(0)
     shape = SMALL.model_copy(update={"widths": (32, 32, 32)})

@@ -261,6 +261,7 @@ def test_a_white_ceiling_a_white_wall_and_the_sun_on_a_wall_are_no_windows(
     assert "taken for white walls" in caplog.text
 
 
+@pytest.mark.long
 def test_a_window_in_a_white_wall_is_opened_alone(dense_surfels) -> None:
     """A white sky; the wall around it is 2.4 times as bright as the others."""
     found = room(dense_surfels, ceiling=True, window=False)
@@ -273,6 +274,7 @@ def test_a_window_in_a_white_wall_is_opened_alone(dense_surfels) -> None:
     assert _rows(found.means[clear]) <= _rows(closed.means), "a wall is gone"
 
 
+@pytest.mark.long
 def test_a_wall_that_is_overexposed_is_no_window(dense_surfels, caplog: pytest.LogCaptureFixture) -> None:
     """All of it but its edge, white in photos; sky masks, if there are, say that it is a glass front."""
     found = room(dense_surfels, ceiling=True, window=False)

@@ -145,6 +145,7 @@ def fits(box: Box) -> dict[float, JointFit]:
         return {factor: box.fitted(patch, factor) for factor in (0.4, 2.5)}
 
 
+@pytest.mark.long
 @pytest.mark.parametrize("factor", [0.4, 2.5])
 def test_light_paint_and_gloss_are_found_whatever_the_light_was_thought_to_be(
     box: Box, fits: dict[float, JointFit], factor: float
