@@ -7,7 +7,8 @@ from typing import Annotated
 from annotated_types import Gt, Interval, Len
 from typing_extensions import TypedDict
 
-_Side = Annotated[int, Interval(ge=1, le=16_384)]
+Side = Annotated[int, Interval(ge=1, le=16_384)]
+"""Pixels along a side of a frame."""
 _Row = Annotated[list[float], Len(4, 4)]
 
 
@@ -24,6 +25,6 @@ class CameraRecord(TypedDict):
     fy: Annotated[float, Gt(0)]
     cx: float
     cy: float
-    width: _Side
-    height: _Side
+    width: Side
+    height: Side
     world_to_camera: Annotated[list[_Row], Len(4, 4)]

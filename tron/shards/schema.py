@@ -10,12 +10,12 @@ from __future__ import annotations
 import re
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.camera_record import CameraRecord
+from tron.camera_record import CameraRecord, Side
 from tron.color import agx, linear_to_srgb
 from tron.errors import TronError
 
@@ -158,9 +158,6 @@ def members_table() -> str:
     return "\n".join(rows) + "\n"
 
 
-_Side = Annotated[int, Field(ge=1, le=16_384)]
-
-
 class ClipMeta(BaseModel):
     """Metadata of a clip: its meta.json."""
 
@@ -177,8 +174,8 @@ class ClipMeta(BaseModel):
     )
     split: str = Field(pattern=rf"^{SPLIT_PATTERN.pattern}$", description="Split that the clip is of.")
     frames: int = Field(ge=1, le=10_000, description="Number of frames.")
-    width: _Side = Field(description="Pixels of each frame.")
-    height: _Side = Field(description="Pixels of each frame.")
+    width: Side = Field(description="Pixels of each frame.")
+    height: Side = Field(description="Pixels of each frame.")
     cameras: list[CameraRecord] = Field(description="The camera of each frame, in order.")
     exposure: float = Field(
         gt=0, description="Factor on linear values before AgX, the same for all clips of a scene and light."

@@ -54,10 +54,7 @@ class MaterialSearch:
             told: what is being done, and the share of it that is done.
             done: called once, with why nothing was found; empty where materials are kept now.
         """
-        opened = {
-            name: str(value) if isinstance(value, Path) else value for name, value in self.opened.items()
-        }
-        given = {"file": str(self.file), "opened": opened, "variant": self.variant, "threads": self.threads}
+        given = {"file": self.file, "opened": self.opened, "variant": self.variant, "threads": self.threads}
         # No fork beside Dr.Jit's threads; and a spawned process would run a caller's script once more.
         self._process = subprocess.Popen(
             [sys.executable, "-P", "-m", __name__, json.dumps(given, default=str)],
