@@ -10,10 +10,10 @@ from tron.apps.relight.command import main
 from tron.apps.relight.settings import DisplayOnly, Settings
 from tron.errors import TronError
 
-DISPLAY = set(
-    "output_dir background exposure look checkpoint window overlap reproject weights vae buffers overwrite "
-    "threads".split()
-)
+DISPLAY = {
+    *("output_dir", "background", "exposure", "look", "checkpoint", "window", "overlap", "reproject"),
+    *("weights", "vae", "buffers", "overwrite", "threads"),
+}
 """Settings that change no traced frame: pictures are made of the frames anew in each run."""
 
 
