@@ -180,7 +180,7 @@ def test_kept_ones_are_taken_and_none_are_looked_for(asked, plain, tmp_path, cap
     """As tron-view opens a scan: at once."""
     assert with_materials(plain, beside(tmp_path), None, 0, find=False) is plain
     assert not asked
-    assert "materials=auto finds them" in caplog.text
+    assert "by materials=auto, or a button of tron-view" in caplog.text
     found = with_materials(plain, beside(tmp_path), None, 0)
     kept = with_materials(plain, beside(tmp_path), None, 0, find=False)
     np.testing.assert_array_equal(kept.base_color, found.base_color)
