@@ -18,6 +18,7 @@ import json
 import logging
 from collections import Counter
 from collections.abc import Collection, Mapping, Sequence
+from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
 from typing import Literal
@@ -230,7 +231,8 @@ def load_models(folder: Path, assets: Sequence[Asset]) -> dict[str, list[Part]]:
 
 @lru_cache(maxsize=64)
 def _load(path: str, up: str, _sha256: str) -> list[Part]:
-    return load_model(path, up)
+    # Worlds are lit by their environment alone: true irradiance, and many lights at once, know no other.
+    return [replace(part, emission=None) for part in load_model(path, up)]
 
 
 def read_catalogue(path: Path, required: bool) -> dict[str, Entry]:

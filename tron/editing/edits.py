@@ -236,31 +236,34 @@ class Material(_Selecting):
 
     Attributes:
         base_color: linear RGB, or a scale.
+        emission: linear radiance that they emit, of any size, or a scale.
         roughness, metallic: a value, or a scale.
         hue: degrees of the color wheel, or a turn; greys have none and stay.
     """
 
     action: Literal["material"] = "material"
     base_color: Color | Scale | None = None
+    emission: tuple[Factor, Factor, Factor] | Scale | None = None
     roughness: Unit | ScaleOne | None = None
     metallic: Unit | ScaleOne | None = None
     hue: float | Turned | None = None
 
     @model_validator(mode="after")
     def _changes(self) -> Material:
-        if all(each is None for each in (self.base_color, self.roughness, self.metallic, self.hue)):
-            raise ValueError("say what changes: base_color, roughness, metallic or hue")
+        given = (self.base_color, self.emission, self.roughness, self.metallic, self.hue)
+        if all(each is None for each in given):
+            raise ValueError("say what changes: base_color, emission, roughness, metallic or hue")
         return self
 
     def apply(self, scene: GaussianScene, views: Views) -> GaussianScene:
         """The scene with them made of other stuff; nothing of it moves."""
         which, changed = self.selected(scene, views), {}
-        for name in ("base_color", "roughness", "metallic"):
+        for name in ("base_color", "emission", "roughness", "metallic"):
             change = getattr(self, name)
             if change is not None:
-                values = getattr(scene, name).copy()
+                values, most = getattr(scene, name).copy(), np.inf if name == "emission" else 1
                 scales = isinstance(change, Scale | ScaleOne)
-                values[which] = np.clip(values[which] * change.scale, 0, 1) if scales else change
+                values[which] = np.clip(values[which] * change.scale, 0, most) if scales else change
                 changed[name] = values
         if self.hue is not None:
             values = changed.get("base_color", scene.base_color).copy()

@@ -44,6 +44,7 @@ FIELDS = {
     "metallic": Field((), ("metallic",), unit=True),
     "object_id": Field((), ("object_id",), trained=False, dtype=np.int32),
     "log_thickness": Field((), ("scale_2",), trained=False, zero=True),
+    "emission": Field((3,), ("emission_0", "emission_1", "emission_2"), trained=False),
 }
 PARAMETERS = tuple(name for name, field in FIELDS.items() if field.trained)
 MATERIALS = tuple(name for name, field in FIELDS.items() if field.unit)

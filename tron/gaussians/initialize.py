@@ -123,7 +123,8 @@ def surfels_from_points(
     """The same of one object's points, which lie evenly on its surface.
 
     Args:
-        values: position, normal (unit), base_color (linear), (N, 3) each, and roughness, metallic, (N, 1).
+        values: position, normal (unit), base_color (linear), (N, 3) each, and roughness, metallic, (N, 1);
+            emission (linear radiance), (N, 3), where something glows.
         object_id: of the surfels.
         count, kernel_degree: as of :func:`surfels_from_gbuffers`.
     """
@@ -171,6 +172,7 @@ def _surfels(
         kernel_degree=kernel_degree,
         spacing=spacing,
         up=np.asarray(up),
+        emission=samples.values.get("emission", np.empty((0, 3))),
     ).validate()
 
 

@@ -4,8 +4,8 @@ The vertex element holds float32, little endian, in the order of the 3DGS refere
 f_dc_0..2, f_rest_0..44 (channel-major: 15 red, 15 green, 15 blue), opacity (logit), scale_0..2 (log),
 rot_0..3 (w, x, y, z). The third scale is along the normal; of a flat surfel it is written negligibly small
 for readers that expect it. Our materials follow as extra properties that other readers skip: base_color_0..2
-(linear), roughness, metallic and object_id (int). What belongs to the whole scene stands in comments:
-``comment tron spacing 0.01``.
+(linear), roughness, metallic and object_id (int), of scenes that glow emission_0..2 (linear). What belongs to
+the whole scene stands in comments: ``comment tron spacing 0.01``.
 
 The header of a file is held against the file's size before anything is allocated, so that a few hostile bytes
 cannot ask for terabytes. A file may be compressed by gzip.
@@ -38,6 +38,7 @@ from tron.storage import atomic_path
 NORMAL = ("nx", "ny", "nz")
 REST = tuple(f"f_rest_{i}" for i in range(3 * (SH_COUNT - 1)))
 (THIRD_SCALE,) = FIELDS["log_thickness"].properties
+EMISSION_PROPERTIES = FIELDS["emission"].properties
 MATERIAL_PROPERTIES = tuple(name for material in MATERIALS for name in FIELDS[material].properties)
 REQUIRED = tuple(
     name
@@ -115,7 +116,8 @@ def write_ply(
     add(FIELDS["opacity_logits"].properties, scene["opacity_logits"])
     add(FIELDS["log_scales"].properties, log_scales)
     add([THIRD_SCALE], third_scales(log_scales, scene["log_thickness"]))
-    for name in ("quats", *(() if plain else (*MATERIALS, "object_id"))):
+    own = () if plain else (*MATERIALS, "object_id", *(["emission"] if np.any(scene["emission"]) else []))
+    for name in ("quats", *own):
         add(FIELDS[name].properties, scene[name])
     kinds = {name: "<f8" if values.dtype == np.float64 else "<f4" for name, values in columns.items()}
     rows = np.empty(len(sh), dtype=list((kinds if plain else kinds | {"object_id": "<i4"}).items()))

@@ -18,6 +18,7 @@ from tron.gaussians.foreign_properties import plain_columns
 from tron.gaussians.formats.registry import check_header
 from tron.gaussians.harmonics import SH_COUNT, dc_to_rgb
 from tron.gaussians.ply import (
+    EMISSION_PROPERTIES,
     EXPORT,
     GUESSED_UP,
     MATERIAL_PROPERTIES,
@@ -110,6 +111,7 @@ def read_splats(path: str | Path) -> dict[str, Any]:
         "sh": sh,
         **(_guess(sh) if guessed else {name: field(name) for name in MATERIALS}),
         "object_id": _object_id(columns, len(means), path),
+        **({"emission": field("emission")} if EMISSION_PROPERTIES[0] in columns else {}),
         "kernel_degree": int(constants.get("kernel_degree", [2])[0]),
         **({"spacing": constants["spacing"][0]} if "spacing" in constants else {}),
         "turn": turn,
@@ -158,16 +160,17 @@ def _check_properties(columns: dict[str, np.ndarray], comments: Sequence[str], p
     if missing:
         made = f"made for {foreign}: export it as plain 3DGS" if foreign else EXPORT
         raise TronError(f"the PLY lacks {', '.join(missing)}", path, made)
-    read = (*REQUIRED, *REST, *MATERIAL_PROPERTIES, THIRD_SCALE, FILTER, "object_id")
+    read = (*REQUIRED, *REST, *MATERIAL_PROPERTIES, *EMISSION_PROPERTIES, THIRD_SCALE, FILTER, "object_id")
     for name, values in columns.items():
         if values.dtype == object and name in read:
             raise TronError(f"property {name} is a list", path, EXPORT)
     if foreign:
         log.warning("%s: %s: %s", path, "not read, so that it may look different here", foreign)
-    present = [name for name in MATERIAL_PROPERTIES if name in columns]
-    if present and len(present) < len(MATERIAL_PROPERTIES):
-        absent = ", ".join(name for name in MATERIAL_PROPERTIES if name not in columns)
-        raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all materials or none")
+    for together in (MATERIAL_PROPERTIES, EMISSION_PROPERTIES):
+        present = [name for name in together if name in columns]
+        absent = ", ".join(name for name in together if name not in columns)
+        if present and absent:
+            raise TronError(f"the PLY has {present[0]} but lacks {absent}", path, "write all of them or none")
 
 
 def _guess(sh: np.ndarray) -> dict[str, np.ndarray]:

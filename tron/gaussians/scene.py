@@ -68,6 +68,8 @@ class GaussianScene:
             space, or as the program that a scan's splats were learnt with projects them.
         log_thickness: (M,) natural logarithm of the standard deviation along the normal, world units, the
             least of three; -infinity, as of all by default, of flat surfels. Only ``projection`` shows it.
+        emission: (M, 3) radiance that the front of a surfel emits, the same in all directions, linear
+            (Rec.709), not below 0; 0, as of all by default, where nothing glows.
     """
 
     means: np.ndarray
@@ -88,11 +90,14 @@ class GaussianScene:
     offset: np.ndarray = field(default_factory=lambda: np.zeros(3))
     projection: str = DISKS
     log_thickness: np.ndarray = field(default_factory=lambda: np.empty(0))
+    emission: np.ndarray = field(default_factory=lambda: np.empty((0, 3)))
 
     def __post_init__(self) -> None:
-        # Flat scenes may be made of others of more or fewer surfels without a word of it.
+        # Flat and dark scenes may be made of others of more or fewer surfels without a word of it.
         if len(self.log_thickness) != len(self.means) and np.isneginf(self.log_thickness).all():
             self.log_thickness = np.full(len(self.means), -np.inf)
+        if len(self.emission) != len(self.means) and not np.any(self.emission):
+            self.emission = np.zeros((len(self.means), 3), np.float32)
         for name, described in FIELDS.items():
             setattr(self, name, np.ascontiguousarray(getattr(self, name), dtype=described.dtype))
         self.up = np.asarray(self.up, dtype=np.float64)
@@ -200,6 +205,9 @@ class GaussianScene:
             if values.min() < -_TOLERANCE or values.max() > 1 + _TOLERANCE:
                 bad = ((values < -_TOLERANCE) | (values > 1 + _TOLERANCE)).any(axis=1)
                 raise TronError(f"{name} of {bad.sum()} surfels is outside [0, 1] (first: {bad.argmax()})")
+        bad = (self.emission < 0).any(axis=1)
+        if bad.any():
+            raise TronError(f"emission of {bad.sum()} surfels is below 0 (first: surfel {bad.argmax()})")
         bad = (np.abs(self.log_scales) > LOG_SCALE_LIMIT).any(axis=1)
         if bad.any():
             raise TronError(f"log_scales of {bad.sum()} surfels are absurd (first: surfel {bad.argmax()})")

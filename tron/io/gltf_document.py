@@ -35,6 +35,7 @@ HONOURED = {
     "KHR_gaussian_splatting": "splats: a scene, not a model",
     "KHR_texture_transform": "offset, scale and rotation",
     "KHR_texture_basisu": "KTX2: plain pixels; Basis by opengl_basisu (`pip install 'tron-relight[ktx2]'`)",
+    "KHR_materials_emissive_strength": "factor on what fronts emit",
     "EXT_texture_webp": "decoded by Pillow",
     "EXT_texture_avif": "decoded by Pillow",
 }
@@ -51,7 +52,6 @@ APPROXIMATED = {
     "KHR_materials_dispersion": "opaque",
     "KHR_materials_ior": "1.5",
     "KHR_materials_specular": "1",
-    "KHR_materials_emissive_strength": "nothing emits",
     "KHR_materials_variants": "the default variant",
 }
 IGNORED = {

@@ -57,6 +57,7 @@ def textured(
     vertices, normals = vertices[origin], normals[origin]
     flat = _flat(faces, uv)
     base_color, roughness, metallic = np.zeros((size, size, 3), np.float32), *np.zeros((2, size, size))
+    emission = np.zeros_like(base_color) if tracer.scene.emission.any() else None
     known = np.zeros((size, size), bool)
     for start in track(range(0, size, max(1, _AT_ONCE // size)), "textures"):
         at, place, normal = _texels(flat, vertices, normals, faces, size, start)
@@ -68,6 +69,8 @@ def textured(
         known[at] = np.array(seen.opacity) > _OPAQUE
         base_color[at] = np.array(seen.base_color).T
         roughness[at], metallic[at] = np.array(seen.roughness), np.array(seen.metallic)
+        if emission is not None:
+            emission[at] = np.array(seen.emission).T
     # What nothing covers has the nearest texel that something does, so that no lookup mixes in black.
     texel = ndimage.distance_transform_edt(~known, return_distances=False, return_indices=True)
     assert isinstance(texel, np.ndarray)
@@ -77,6 +80,7 @@ def textured(
         vertices=vertices, normals=normals, faces=faces.astype(np.int64), uv=uv,
         base_color=np.clip(base_color, 0, 1), roughness=np.clip(roughness, 0, 1),
         metallic=np.clip(metallic, 0, 1), normal_map=None,
+        emission=None if emission is None else emission[row, column],
     )  # fmt: skip
 
 

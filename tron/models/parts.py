@@ -32,6 +32,7 @@ class Part:
         base_color: (h, w, 3) linear image, (V, 3) linear per vertex, or (3,) linear.
         roughness, metallic: (h, w) image or number.
         normal_map: (h, w, 3) tangent-space normals stored as (n + 1) / 2, y up in the image; or None.
+        emission: radiance that the front emits, (h, w, 3) linear image or (3,) linear; None: none.
         tint: (V, 3) linear colours that a base color image is multiplied by, or None.
         sampling: field that holds an image -> how it is looked up; one that is absent repeats at (u, v).
     """
@@ -46,6 +47,7 @@ class Part:
     normal_map: np.ndarray | None
     tint: np.ndarray | None = None
     sampling: Mapping[str, Sampling] = field(default_factory=dict)
+    emission: np.ndarray | None = None
 
     def moved(self, matrix: np.ndarray, scale: float = 1.0) -> Part:
         """The part scaled about its origin, then moved by a rigid (4, 4) ``matrix``."""

@@ -64,7 +64,11 @@ def textured(part: Part, name: str) -> Shape:
 
 
 def _shape(part: Part, name: str, bsdf: mi.BSDF) -> mi.Mesh:
-    made = mitsuba_mesh(name, bsdf, part.vertices, part.normals, part.faces, part.uv)
+    emitter = None
+    if part.emission is not None:
+        radiance = mitsuba_texture(part.emission, part.sampling.get("emission"))
+        emitter = mi.load_dict({"type": "area", "radiance": radiance})
+    made = mitsuba_mesh(name, bsdf, part.vertices, part.normals, part.faces, part.uv, emitter)
     if part.base_color.ndim == 2:
         made.add_attribute("vertex_base_color", 3, flat(part.base_color))
     if part.tint is not None:
@@ -100,10 +104,16 @@ def mitsuba_mesh(
     normals: np.ndarray,
     faces: np.ndarray,
     uv: np.ndarray | None,
+    emitter: mi.Emitter | None = None,
 ) -> mi.Mesh:
-    """Triangles (F, 3) of ``vertices`` and unit ``normals`` (V, 3), and texture coordinates (V, 2) if any."""
+    """Triangles (F, 3) of ``vertices`` and unit ``normals`` (V, 3), and texture coordinates (V, 2) if any.
+
+    ``emitter``: of an area, which its fronts are; None: it does not glow.
+    """
     properties = mi.Properties()
     properties["bsdf"] = bsdf
+    if emitter is not None:
+        properties["emitter"] = emitter
     mesh = mi.Mesh(
         name,
         len(vertices),
@@ -208,3 +218,13 @@ def materials_at(
         roughness = dr.select(here, each.material.eval_attribute_1("roughness", si, here), roughness)
         metallic = dr.select(here, each.material.eval_attribute_1("metallic", si, here), metallic)
     return base_color, roughness, metallic
+
+
+def emission_at(shapes: Sequence[Shape], si: mi.SurfaceInteraction3f) -> mi.Color3f | None:
+    """Linear radiance that what is met emits towards the rays' origins; None where no shape glows."""
+    glowing = [each.shape for each in shapes if each.shape.is_emitter()]
+    emission = mi.Color3f(0.0)
+    for shape in glowing:
+        here = si.is_valid() & (si.shape == mi.ShapePtr(shape))
+        emission = dr.select(here, shape.emitter().eval(si, here), emission)
+    return emission if glowing else None

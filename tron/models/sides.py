@@ -36,6 +36,8 @@ WELDED, OFF = 1e-6, 1e-5
 def two_sided(parts: Sequence[Part]) -> list[Part]:
     """The parts, then the backs of theirs that are seen, turned around, without normal maps: for surfels.
 
+    Backs do not glow.
+
     Args:
         parts: of one model.
     """
@@ -53,7 +55,9 @@ def two_sided(parts: Sequence[Part]) -> list[Part]:
         seen[bare] = _seen(corners, front, bare)
     ends = np.cumsum([len(part.faces) for part in parts])
     backs = [
-        replace(part, faces=part.faces[chosen][:, ::-1], normals=-part.normals, normal_map=None)
+        replace(
+            part, faces=part.faces[chosen][:, ::-1], normals=-part.normals, normal_map=None, emission=None
+        )
         for part, chosen in zip(parts, np.split(seen, ends[:-1]), strict=True)
         if chosen.any()
     ]

@@ -49,6 +49,8 @@ def surfels_of_model(
     rng = seeds.generator(seed, "surfels of a model")
     numbers = rng.multinomial(round(POINTS * count), [each.sum() / area for each in sizes])
     drawn = [_points(*each, rng) for each in zip(parts, sizes, numbers) if each[2]]
+    if any("emission" in each for each in drawn):
+        drawn = [{"emission": np.zeros_like(each["position"])} | each for each in drawn]
     values = {name: np.concatenate([each[name] for each in drawn]) for name in drawn[0]}
     return surfels_from_points(values, object_id, round(count), kernel_degree)
 
@@ -87,6 +89,8 @@ def _points(part: Part, sizes: np.ndarray, number: int, rng: np.random.Generator
         "normal": normal / np.maximum(np.linalg.norm(normal, axis=1, keepdims=True), 1e-12),
         "base_color": np.clip(np.broadcast_to(color, (number, 3)), 0, 1),
     }
+    if part.emission is not None:
+        found["emission"] = np.broadcast_to(_looked_up(part, "emission", uv, 3), (number, 3))
     for name in ("roughness", "metallic"):
         found[name] = np.broadcast_to(np.clip(_looked_up(part, name, uv, 1), 0, 1), (number, 1))
     sound = np.linalg.norm(found["normal"], axis=1) > 0.5  # opposite corners cancel

@@ -6,6 +6,7 @@ from __future__ import annotations
 
 import tempfile
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from PIL import Image
@@ -21,11 +22,12 @@ from tron.storage import write_atomic
 
 
 def write_glb(path: Path, part: Part) -> None:
-    """Write a part that has one image each of base color, roughness and metallic.
+    """Write a part that has one image each of base color, roughness and metallic, of emission if it glows.
 
     Args:
         path: the file.
-        part: z up. Its base color is stored as sRGB, roughness as green and metallic as blue, of 8 bits.
+        part: z up. Its base color is stored as sRGB, roughness as green and metallic as blue, of 8 bits;
+            emission as sRGB, a share of its highest value, which the strength of the material is.
 
     Raises:
         TronError: the file cannot be written.
@@ -37,12 +39,22 @@ def write_glb(path: Path, part: Part) -> None:
         baseColorTexture=_image(linear_to_srgb(part.base_color)), metallicRoughnessTexture=_image(surface),
         metallicFactor=1.0, roughnessFactor=1.0,
     )  # fmt: skip
+    share, highest = _glow(part)
+    if highest > 0:
+        material.emissiveTexture, material.emissiveFactor = _image(share), np.ones(3)
+
+    def strengthen(tree: dict[str, Any]) -> None:
+        name = "KHR_materials_emissive_strength"
+        for each in tree["materials"] if highest > 0 else ():
+            each["extensions"] = {name: {"emissiveStrength": highest}}
+            tree["extensionsUsed"] = [name]
+
     uv = np.stack([part.uv[:, 0], 1 - part.uv[:, 1]], axis=1)  # trimesh counts v from the bottom
     mesh = Trimesh(
         part.vertices @ Y_UP.T, part.faces, vertex_normals=part.normals @ Y_UP.T,
         visual=TextureVisuals(uv, material=material), process=False,
     )  # fmt: skip
-    content = mesh.export(file_type="glb", include_normals=True)
+    content = mesh.export(file_type="glb", include_normals=True, tree_postprocessor=strengthen)
     assert isinstance(content, bytes)
     write_atomic(path, content)
 
@@ -93,6 +105,9 @@ def write_usdz(path: Path, part: Part) -> None:
             "roughness": ("roughness", part.roughness, "raw", "r", kinds.Float),
             "metallic": ("metallic", part.metallic, "raw", "r", kinds.Float),
         }
+        share, highest = _glow(part)
+        if highest > 0:
+            stored["emissiveColor"] = ("emission", share, "sRGB", "rgb", kinds.Color3f)
         for name, (file, values, space, channels, kind) in stored.items():
             _image(np.asarray(values)).save(Path(folder) / f"{file}.png")
             texture = UsdShade.Shader.Define(stage, f"/scene/material/{file}")
@@ -100,6 +115,8 @@ def write_usdz(path: Path, part: Part) -> None:
             texture.CreateInput("file", kinds.Asset).Set(f"./{file}.png")
             texture.CreateInput("sourceColorSpace", kinds.Token).Set(space)
             texture.CreateInput("fallback", kinds.Float4).Set(Gf.Vec4f(0.5, 0.5, 0.5, 1))
+            if file == "emission":
+                texture.CreateInput("scale", kinds.Float4).Set(Gf.Vec4f(highest))
             texture.CreateInput("st", kinds.Float2).ConnectToSource(found)
             output = texture.CreateOutput(channels, kinds.Float3 if channels == "rgb" else kinds.Float)
             surface.CreateInput(name, kind).ConnectToSource(output)
@@ -109,6 +126,13 @@ def write_usdz(path: Path, part: Part) -> None:
         package = Path(folder) / "mesh.usdz"
         UsdUtils.CreateNewUsdzPackage(Sdf.AssetPath(str(layer)), str(package))
         write_atomic(path, package.read_bytes())
+
+
+def _glow(part: Part) -> tuple[np.ndarray, float]:
+    """(h, w, 3) what a part emits over its highest value, sRGB, and that value; 0 where nothing glows."""
+    emission = np.zeros((1, 1, 3)) if part.emission is None else part.emission
+    highest = float(emission.max())
+    return linear_to_srgb(emission / (highest or 1.0)), highest
 
 
 def _image(values: np.ndarray) -> Image.Image:

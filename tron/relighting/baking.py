@@ -147,6 +147,8 @@ def _radiance(light: Illumination, surface: Surface) -> np.ndarray:
     bounced = bounced_light(surface, arriving, response)
     assert bounced is not None
     radiance = response.lit(response.unshadowed * arriving.visibility, bounced)
+    if surface.emission is not None:
+        radiance += surface.emission
     dr.eval(radiance)
     return np.array(radiance).T
 

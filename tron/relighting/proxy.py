@@ -93,10 +93,9 @@ class Proxy:
         """The proxy of a scan whose splats stand as those that this one was made from, with its materials."""
         lent = lenders(self.surfels, scan) if self.lent is None else self.lent
         numbers, weights = lent
-        found = {
-            name: np.clip(np.einsum("mk,mk...->m...", weights, getattr(scan, name)[numbers]), 0, 1)
-            for name in MATERIALS
-        }
+        names = (*MATERIALS, "emission")
+        found = {name: np.einsum("mk,mk...->m...", weights, getattr(scan, name)[numbers]) for name in names}
+        found |= {name: np.clip(found[name], 0, 1) for name in MATERIALS}
         return replace(self, surfels=replace(self.surfels, **found), lent=lent)
 
     def save(self, path: Path, made_from: str) -> None:
@@ -126,7 +125,8 @@ def fingerprint(scene: GaussianScene, cameras: Sequence[Camera] | None) -> str:
     """Hexadecimal digest of all that a proxy is made from."""
     digest = hashlib.sha256(_MADE.encode())
     for name in FIELDS:
-        digest.update(np.ascontiguousarray(getattr(scene, name)).tobytes())
+        if name != "emission" or scene.emission.any():  # proxies of before know of none
+            digest.update(np.ascontiguousarray(getattr(scene, name)).tobytes())
     seen = () if scene.projection == DISKS else (scene.projection,)
     digest.update(repr((scene.kernel_degree, scene.oriented, scene.up.tolist(), *seen)).encode())
     for camera in cameras or ():

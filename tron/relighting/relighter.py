@@ -218,12 +218,13 @@ class Relighter:
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
         """(M,) the scene's surfels at their centres, facing as light sees them, with ``values`` of a bake."""
+        emission = self._tracer.emission
         if self._proxied is not None:
-            return self._proxied.surfels(values)
+            return replace(self._proxied.surfels(values), emission=emission)
         count = len(self.scene)
         found = centres(self._light.records, dr.arange(mi.UInt32, count))
         own = values if self._beside is None else [some_of(value, 0, count) for value in values]
-        return replace(found, values=list(own))
+        return replace(found, values=list(own), emission=emission)
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
         """What a camera sees; ``values`` of the surfels that light sees are composited too."""

@@ -15,7 +15,8 @@ where nothing is in the way. :class:`tron.estimation.Estimation` chooses, also t
 
 Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
 with the share of :mod:`tron.shading.composition`, exactly 0 behind opaque surfels. All of it is linear;
-exposure and AgX are applied when a buffer is looked at or loaded.
+exposure and AgX are applied when a buffer is looked at or loaded. What glows adds what it emits to pbr,
+shadowed and lit.
 """
 
 from __future__ import annotations
@@ -261,6 +262,8 @@ def shade_surface(
         "indirect": mi.Color3f(0) if bounced is None else bounced.indirect,
         "lit": response.direct(irradiance) if bounced is None else response.lit(irradiance, bounced),
     }
+    if surface.emission is not None:
+        buffers |= {name: buffers[name] + surface.emission for name in ("pbr", "shadowed", "lit")}
     buffers = {name: over_background(color, behind, surface.opacity) for name, color in buffers.items()}
     dr.eval(buffers)
     return buffers

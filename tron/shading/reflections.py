@@ -272,6 +272,8 @@ def _returned(
         mirror = _mirrored(tracer, hit.surfel, direction, metal, visibility, lighting, bounce, brdf, seeds)
         bounced = with_mirror(bounced, mirror, further)
     shown = response.lit(direct, bounced)
+    if bounce.emitted is not None:
+        shown += of(bounce.emitted, front)
     return dr.select(hit.front, shown, of(bounce.behind, met & ~hit.front))
 
 

@@ -62,8 +62,8 @@ class GBuffer(Surface):
         """The G-buffer of pixels that come row by row."""
         _, x, y, inside = tile_pixels(width, height)
         pixel = y * dr.opaque(mi.UInt32, width) + x
-        tiled = dr.gather(Surface, surface, pixel, inside)
-        return GBuffer(**vars(tiled), width=width, height=height)
+        tiled = dr.gather(dict, _held(surface), pixel, inside)
+        return GBuffer(**{"values": []} | tiled, width=width, height=height)
 
     @property
     def pixel(self) -> mi.UInt32:
@@ -95,7 +95,7 @@ class GBuffer(Surface):
         return self.images(self._fields())
 
     def _fields(self) -> dict[str, Any]:
-        return {f.name: getattr(self, f.name) for f in fields(Surface) if f.name != "values" or self.values}
+        return _held(self)
 
     def _pixels(self, value: Any) -> np.ndarray:
         if isinstance(value, mi.Float):
@@ -103,6 +103,12 @@ class GBuffer(Surface):
         # One by one: together they would be laid one behind another by a kernel of every size's own.
         channels = np.stack([np.array(channel) for channel in value], axis=-1)
         return channels.reshape(self.height, self.width, -1)
+
+
+def _held(surface: Surface) -> dict[str, Any]:
+    """The fields of a surface that hold something."""
+    names = [f.name for f in fields(Surface) if f.name != "values" or surface.values]
+    return {name: getattr(surface, name) for name in names if getattr(surface, name) is not None}
 
 
 @dataclass
@@ -306,6 +312,8 @@ def _joined(upper: GBuffer, lower: GBuffer) -> GBuffer:
     """One view of two stripes, the upper one of whole tiles; differentiable."""
 
     def join(above: Any, below: Any) -> Any:
+        if above is None:
+            return None
         if isinstance(above, list):
             return [join(*each) for each in zip(above, below, strict=True)]
         if isinstance(above, mi.Float):

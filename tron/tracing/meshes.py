@@ -30,7 +30,7 @@ from scipy.spatial import KDTree
 from tron.errors import TronError
 from tron.gaussians.edit import joined, moved
 from tron.gaussians.scene import GaussianScene
-from tron.models.shapes import Shape, materials_at, surface_points, textured
+from tron.models.shapes import Shape, emission_at, materials_at, surface_points, textured
 from tron.runtime import aligned, lanes
 from tron.tracing.gbuffer import GBuffer, tile_rays
 from tron.tracing.surface import seen_normal
@@ -183,6 +183,7 @@ class Meshes:
             roughness=dr.clip(roughness, 0, 1),
             metallic=dr.clip(metallic, 0, 1),
             face=face,
+            emission=emission_at(self._shapes, si),
         )
         dr.eval(layer)
         return layer
@@ -217,6 +218,7 @@ class MeshLayer:
         normal: unit shading normal that the ray sees. leaving: as of :class:`MeshView`.
         base_color, roughness, metallic: of the material there, linear.
         face: mi.UInt32, number of the triangle among those of all parts.
+        emission: linear radiance that it emits towards the ray; None where no mesh glows.
     """
 
     met: mi.Bool
@@ -228,6 +230,7 @@ class MeshLayer:
     roughness: mi.Float
     metallic: mi.Float
     face: mi.UInt32
+    emission: mi.Color3f | None
 
     @property
     def limit(self) -> mi.Float:
@@ -251,6 +254,10 @@ class MeshLayer:
         length = dr.norm(normal)
         normal = dr.select(self.met & (length > 0), normal / dr.select(length > 0, length, 1), surfels.normal)
         colors = zip(surfels.base_color, self.base_color, strict=True)
+        emission = None
+        if surfels.emission is not None or self.emission is not None:
+            glows = [mi.Color3f(0) if each is None else each for each in (surfels.emission, self.emission)]
+            emission = mi.Color3f(*[mixed(front, back) for front, back in zip(*glows, strict=True)])
         view = MeshView(
             position=mi.Point3f(dr.select(own, self.position, surfels.position)),
             depth=dr.select(own, self.depth, surfels.depth),
@@ -264,6 +271,7 @@ class MeshLayer:
             opacity=dr.select(self.met, 1, surfels.opacity),
             direction=surfels.direction,
             values=[mixed(front, back) for front, back in zip(surfels.values, values, strict=True)],
+            emission=emission,
             leaving=dr.select(own, self.leaving, normal),
             width=surfels.width,
             height=surfels.height,

@@ -12,7 +12,7 @@ one face's there, and on a ridge so is the point, unless geometry is differentia
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 
 import drjit as dr
 import mitsuba as mi
@@ -49,6 +49,7 @@ class Surface:
         opacity: mi.Float, 1 - T.
         direction: mi.Vector3f, the unit ray, world.
         values: list of mi.Float, what else was composited, in the unit of each; none unless asked for.
+        emission: mi.Color3f, linear radiance that it emits towards the ray; None where nothing glows.
     """
 
     position: mi.Point3f
@@ -63,6 +64,7 @@ class Surface:
     opacity: mi.Float
     direction: mi.Vector3f
     values: list[mi.Float]
+    emission: mi.Color3f | None = field(default=None, kw_only=True)
 
     def raised(self, offset: mi.Float) -> mi.Point3f:
         """Origins of rays that leave the surface, ``offset`` above it, world units; not differentiated."""

@@ -5,7 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from copy import copy
 from dataclasses import replace
-from typing import TYPE_CHECKING, Self
+from typing import TYPE_CHECKING, Self, TypeVar
 
 import drjit as dr
 import mitsuba as mi
@@ -150,6 +150,12 @@ class SurfelTracer:
         return pack(self._parameters)
 
     @property
+    def emission(self) -> mi.Color3f | None:
+        """(M,) linear radiance that the surfels' fronts emit; None where nothing glows."""
+        emission = self.scene.emission
+        return mi.Color3f(*(mi.Float(aligned(each)) for each in emission.T)) if emission.any() else None
+
+    @property
     def back_faces(self) -> BackFaces:
         return self._beyond if self._two_sided else BackFaces.never()
 
@@ -167,15 +173,16 @@ class SurfelTracer:
             limit: distance along each ray, in tile order, beyond which no surfel counts, world units: what is
                 opaque there hides the rest; None: there is nothing.
         """
-        records = pack_values(self.attached(), values)
+        emission = self.emission
+        records = pack_values(self.attached(), values if emission is None else [*values, *emission])
         projection = PROJECTIONS[self.scene.projection]
         if projection is None:
-            return trace_view(records, camera, limit)
+            return _with_emission(trace_view(records, camera, limit), emission)
         nearest = min(NEAREST, NEAREST_SPACINGS * self.scene.spacing)
         deviations = np.exp(self.scene.log_thickness)
         thickness = mi.Float(aligned(deviations) if len(deviations) else 0)
         seen = projected(records, camera, projection, nearest, thickness)
-        return trace_view(seen, camera, limit, records)
+        return _with_emission(trace_view(seen, camera, limit, records), emission)
 
     def trace(
         self,
@@ -189,8 +196,10 @@ class SurfelTracer:
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
         camera rays fast; ``values`` as there.
         """
-        records = pack_values(self.attached(), values)
-        return trace_rays(records, self.bvh, origin, direction, mi.Bool(active))
+        emission = self.emission
+        records = pack_values(self.attached(), values if emission is None else [*values, *emission])
+        seen = trace_rays(records, self.bvh, origin, direction, mi.Bool(active))
+        return _with_emission(seen, emission)
 
     def first_hits(
         self,
@@ -228,6 +237,16 @@ class SurfelTracer:
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
         return trace(self.bvh, _fans(origin, directions, active, normal), self.back_faces)
+
+
+Seen = TypeVar("Seen", bound=Surface)
+
+
+def _with_emission(seen: Seen, emission: mi.Color3f | None) -> Seen:
+    """The last three of the values of surfels that glow are what they emit."""
+    if emission is None:
+        return seen
+    return replace(seen, values=seen.values[:-3], emission=mi.Color3f(*seen.values[-3:]))
 
 
 def _fans(

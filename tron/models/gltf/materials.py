@@ -1,7 +1,7 @@
-"""glTF materials as linear images: base color, alpha, roughness, metallic, normals (glTF 2.0, section 3.9).
+"""glTF materials as linear images: base color, alpha, roughness, metallic, normals, emission (glTF 2.0, 3.9).
 
-Occlusion is left out, for light is traced; emission too, for surfels emit nothing. Colour profiles are passed
-over, as glTF 2.0 (3.9.2) demands: what a texture holds is said by its use.
+Occlusion is left out, for light is traced. Colour profiles are passed over, as glTF 2.0 (3.9.2) demands: what
+a texture holds is said by its use.
 """
 
 from __future__ import annotations
@@ -32,6 +32,7 @@ _PLAIN = {23: "rgb", 29: "rgb", 30: "bgr", 36: "bgr", 37: "rgba", 43: "rgba", 44
 DIELECTRIC = 0.04
 """Reflectance at normal incidence of what is no metal."""
 
+_LINEAR = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
 _WRAPS: dict[Any, Wrap] = {10497: "repeat", 33071: "clamp", 33648: "mirror"}
 
 
@@ -68,6 +69,7 @@ class Material:
     roughness: np.ndarray | float = 1.0
     metallic: np.ndarray | float = 1.0
     normal_map: np.ndarray | None = None
+    emission: np.ndarray | None = None
     uses: dict[str, TextureUse] = field(default_factory=dict)
 
 
@@ -111,6 +113,8 @@ class Materials:
             scale = _finite(material["normalTexture"].get("scale", 1.0))
             result.normal_map = scaled_normals(self.image(use.image), scale)
             result.uses["normal_map"] = use
+        if "KHR_materials_unlit" not in extensions:
+            _glow(result, read, material)
         return result
 
     def image(self, index: int) -> np.ndarray:
@@ -236,6 +240,24 @@ def _from_specular(read: _Reader, glossy: dict[str, Any]) -> Material:
     return result
 
 
+def _glow(result: Material, read: _Reader, material: dict[str, Any]) -> None:
+    """Give a material what it emits; an image that lies on other texture coordinates has its mean."""
+    strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
+    factor = _factor(material.get("emissiveFactor", (0.0, 0.0, 0.0)), (3,))
+    emission = factor * max(_finite(strength.get("emissiveStrength", 1.0)), 0.0)
+    use = read.use(material.get("emissiveTexture")) if emission.any() else None
+    if use is not None:
+        emission = _LINEAR[read.image(use)[..., :3]] * emission.astype(np.float32)
+        if all(other.texcoord == use.texcoord for other in result.uses.values()):
+            result.uses["emission"] = use
+        else:
+            emission = emission.mean((0, 1))
+    if emission.any():
+        result.emission = emission.astype(np.float32)
+    else:
+        result.uses.pop("emission", None)
+
+
 def _resized(values: np.ndarray, size: tuple[int, int]) -> np.ndarray:
     """(h, w, C) of an image or of a constant (C,)."""
     if values.ndim == 1:
@@ -258,11 +280,10 @@ def _colored(read: _Reader, factor: Any, info: dict[str, Any] | None) -> Materia
     if use is None:
         return Material(factor[:3].astype(np.float32), np.full((1, 1), factor[3]))
     image = read.image(use)
-    table = srgb_to_linear(np.arange(256) / 255.0).astype(np.float32)
     alpha = (
         image[..., 3] * np.float32(factor[3] / 255.0) if image.shape[2] == 4 else np.full((1, 1), factor[3])
     )
-    color = table[image[..., :3]] * factor[:3].astype(np.float32)
+    color = _LINEAR[image[..., :3]] * factor[:3].astype(np.float32)
     return Material(color, alpha, uses={"base_color": use})
 
 

@@ -187,6 +187,7 @@ def _part(geometry: _Geometry, material: Material) -> Part:
         roughness=material.roughness,
         metallic=material.metallic,
         normal_map=material.normal_map,
+        emission=material.emission,
         tint=tint,
         sampling=sampling,
     )
@@ -235,7 +236,9 @@ def _coordinates(
     """
     if not uses:
         return None, {}
-    leading = uses.get("normal_map") or uses.get("base_color") or uses["roughness"]
+    leading = next(
+        uses[name] for name in ("normal_map", "base_color", "roughness", "emission") if name in uses
+    )
     if any(use.texcoord != leading.texcoord for use in uses.values()):
         raise TronError("a material's textures lie on two sets of texture coordinates", mend="bake it to one")
     # A transform that is not invertible (one texel for all) is left to the look-up.

@@ -1,13 +1,14 @@
 """Light that bounces: from every surfel some rays, traced once a scene; bounces of a light are gathers.
 
 What a surfel's cosine-distributed rays meet does not depend on light, so it is found once and kept
-(:class:`BounceTransport`): one word a ray. With E the irradiance / pi of direct light and a the albedo of
-each surfel, its specular lobe included, k bounces are the sum
+(:class:`BounceTransport`): one word a ray. With E the irradiance / pi of direct light, a the albedo of each
+surfel, its specular lobe included, and L what it emits, k bounces are the sum
 
-    I_0 = 0,    I_{k+1}(i) = 1/n sum_r a (E + I_k) (met_r(i))
+    I_0 = 0,    I_{k+1}(i) = 1/n sum_r (a (E + I_k) + L) (met_r(i))
 
-over the n rays of face i that meet one: I is the irradiance / pi of indirect light, a (E + I) what a face
-sends out, the same in all directions. Faces are the M fronts and the backs that rays meet: undersides that no
+over the n rays of face i that meet one: I is the irradiance / pi of indirect light, a (E + I) + L what a face
+sends out, the same in all directions; L is that of fronts alone. Without bounces what glows lights nothing.
+Faces are the M fronts and the backs that rays meet: undersides that no
 camera saw, with light of their own. Rays are stopped as in
 :mod:`tron.tracing.hierarchy.first_hit`, so each estimates the composited radiance without bias.
 
@@ -57,7 +58,7 @@ class BouncedLight:
 
     Attributes:
         direct: mi.Color3f, irradiance / pi of the environment, shadows included.
-        indirect: mi.Color3f, irradiance / pi of light that has met surfels.
+        indirect: mi.Color3f, irradiance / pi of light that has met surfels, or comes from those that glow.
         outgoing: mi.Color3f, radiance that the surfel's front sends out, taken as the same in all directions.
         behind: mi.Color3f, radiance that its back sends out, likewise: by light of its own where rays of
             surfels meet it, else by the indirect light of its front.
@@ -65,6 +66,8 @@ class BouncedLight:
         reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, lent
             among neighbours (:mod:`tron.shading.bounces.lending`); None where that is not known.
         faces: direct light of all faces, fronts first (:meth:`BounceTransport.direct_of_faces`).
+        emitted: mi.Color3f, radiance that the surfel's front emits, of which ``outgoing`` has it already;
+            None where nothing glows.
     """
 
     direct: mi.Color3f
@@ -74,6 +77,7 @@ class BouncedLight:
     openness: mi.Float
     reaching: Callable[[], list[mi.Float]] | None = None
     faces: Sequence[mi.Color3f] = ()
+    emitted: mi.Color3f | None = None
 
     def values(self, rays: int = FINAL.rays) -> list[mi.Float]:
         """What ``SurfelTracer.gbuffer`` composites, for frames of ``rays`` shadow rays a pixel.
@@ -224,8 +228,9 @@ class BounceTransport:
         if behind is not None:
             met, place = [self.rays.met, behind.met], behind.place
         total = [dr.zeros(mi.Color3f, dr.width(there) // self.rays.rays) for there in met]
+        emitted = self.tracer.emission
         for _ in range(bounces):
-            sent = _packed([a * (e + i) for a, e, i in zip(albedo, direct, total, strict=True)])
+            sent = _packed(_sent(albedo, direct, total, emitted))
             total = [
                 _gathered(
                     there,
@@ -308,14 +313,15 @@ class BounceTransport:
         bounces = estimation.bounces if bounces is None else bounces
         albedo = self._of_faces(self.albedo(estimation.brdf))
         indirect = self._indirect(direct, albedo, bounces)
-        outgoing = [a * (e + i) for a, e, i in zip(albedo, direct, indirect, strict=True)]
+        emitted = self.tracer.emission
+        outgoing = _sent(albedo, direct, indirect, emitted)
         behind = albedo[0] * indirect[0]
         if self.undersides is not None:
             place = self.undersides.place
             own = place != NOTHING
             behind = dr.select(own, dr.gather(mi.Color3f, outgoing[1], place, own), behind)
         baked = BouncedLight(
-            direct[0], indirect[0], outgoing[0], behind, self.openness(), faces=tuple(direct)
+            direct[0], indirect[0], outgoing[0], behind, self.openness(), None, tuple(direct), emitted
         )
         dr.eval(baked)
         return baked
@@ -344,6 +350,17 @@ def _of_parts(every: Iterable[Part], count: int, of: Callable[[Part], Iterable[m
             dr.scatter(target, value, part.surfel, part.gbuffer.opacity > 0)
         dr.eval(found)
     return found
+
+
+def _sent(
+    albedo: Sequence[mi.Color3f],
+    direct: Sequence[mi.Color3f],
+    indirect: Sequence[mi.Color3f],
+    emitted: mi.Color3f | None,
+) -> list[mi.Color3f]:
+    """Radiance that all faces send out, fronts first, which alone emit."""
+    front, *backs = [a * (e + i) for a, e, i in zip(albedo, direct, indirect, strict=True)]
+    return [front if emitted is None else front + emitted, *backs]
 
 
 def _packed(colors: Sequence[mi.Color3f]) -> mi.Float:
