@@ -29,6 +29,8 @@ LEAST, SENT, BOUNCES = 0.05, 0.5, 4
 """Of an even light around, the share that a back gets to be seen; what backs send on, and how often."""
 CELLS = 128
 """Cells along the model's longest side: what is seen in a part of one is seen in all of it."""
+BEHIND = 1e-3
+"""Over that side, how far behind a glowing front its back lies."""
 WELDED, OFF = 1e-6, 1e-5
 """Over that side: corners so near are one, and rays begin so far from a triangle."""
 
@@ -55,11 +57,16 @@ def two_sided(parts: Sequence[Part]) -> list[Part]:
         seen[bare] = _seen(corners, front, bare)
     ends = np.cumsum([len(part.faces) for part in parts])
     backs = [
-        replace(
-            part, faces=part.faces[chosen][:, ::-1], normals=-part.normals, normal_map=None, emission=None
-        )
+        replace(part, faces=part.faces[chosen][:, ::-1], normals=-part.normals, normal_map=None)
         for part, chosen in zip(parts, np.split(seen, ends[:-1]), strict=True)
         if chosen.any()
+    ]
+    # Rays would meet the dark back of a glowing sheet as often as its front.
+    backs = [
+        part
+        if part.emission is None
+        else replace(part, vertices=part.vertices + BEHIND * side * part.normals, emission=None)
+        for part in backs
     ]
     return [*parts, *backs]
 
