@@ -152,7 +152,7 @@ def test_a_lamp_lights_its_floor_as_paths_do(dense_surfels, monkeypatch, kind: s
     assert lamp.sum() > 20
     np.testing.assert_allclose(frame.lit[floor].mean(0), truth[floor].mean(0), rtol=0.05)
     error = np.sqrt(((frame.lit - truth)[floor] ** 2).mean()) / truth[floor].mean()
-    assert error < 0.35  # of 32 rays a surfel, of which a tenth meet the lamp
+    assert error < 0.2  # of 32 rays a surfel a tenth meet the lamp
     # The lamp shows itself, and what the floor sends back.
     np.testing.assert_allclose(frame.lit[lamp].mean(0), truth[lamp].mean(0), rtol=0.03)
     alone = Relighter(scene, Estimation(rays=4, bounces=0), proxy="never", meshes=meshes).under(NIGHT)
@@ -288,7 +288,9 @@ def test_gltf_files_hold_what_glows(tmp_path: Path) -> None:
     material = PBRMaterial(emissiveFactor=np.array([1.0, 0.5, 0.0]), emissiveTexture=grey)
     visual = TextureVisuals(part.uv, material=material)
     mesh = trimesh.Trimesh(part.vertices, part.faces, visual=visual, process=False)
-    (tmp_path / "theirs.glb").write_bytes(mesh.export(file_type="glb", tree_postprocessor=strengthen))
+    content = mesh.export(file_type="glb", tree_postprocessor=strengthen)
+    assert isinstance(content, bytes)
+    (tmp_path / "theirs.glb").write_bytes(content)
     parts = load_model(tmp_path / "theirs.glb", up="z", fitted=False)
     surfels = surfels_of_model(two_sided(parts), 0.1)
     front = surfels.normals()[:, 2] > 0

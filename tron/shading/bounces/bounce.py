@@ -314,6 +314,8 @@ class BounceTransport:
         albedo = self._of_faces(self.albedo(estimation.brdf))
         indirect = self._indirect(direct, albedo, bounces)
         emitted = self.tracer.emission
+        if emitted is not None:  # few rays of a surfel meet what glows: of 32 a tenth
+            indirect[0] = mi.Color3f(*self._lending.lent([*indirect[0]]))
         outgoing = _sent(albedo, direct, indirect, emitted)
         behind = albedo[0] * indirect[0]
         if self.undersides is not None:
