@@ -52,7 +52,7 @@ class Settings(BaseModel):
     look: Look = Field("photograph", description="tone: AgX with the contrast that photographs have, or none")
     surroundings: Treatment = Field("drop", description=SURROUNDINGS)
     proxy: Literal["auto", "always", "never"] = Field(
-        "auto", description="what light sees of a scan, as of tron-relight"
+        "auto", description="proxy of a scan on which light is computed, as in tron-relight"
     )
     projection: SeenAs = "auto"
     materials: FoundMaterials = "auto"

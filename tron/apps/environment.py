@@ -53,7 +53,7 @@ class Settings(BaseModel):
         description="column and row of the ball's centre and its radius, pixels; none: the picture's middle",
     )
     distance: float = Field(
-        100.0, gt=1, description="of the camera from the mirror ball's centre, in radii of the ball"
+        100.0, gt=1, description="distance of the camera from the mirror ball's centre, in radii of the ball"
     )
 
     @model_validator(mode="after")

@@ -168,7 +168,7 @@ class GaussianScene:
         )
 
     def upright(self) -> GaussianScene:
-        """Rotate the scene about the origin, the shortest way, so that ``up`` is +z, as in environment maps."""
+        """Rotate the scene the shortest way about the origin so that ``up`` is +z, as in environment maps."""
         turn = upright(self.up)
         return self if np.allclose(turn, np.eye(3)) else self.rotated(turn)
 

@@ -57,8 +57,8 @@ THICK = 0.03
 """Share of thick pixels from which a proxy gains."""
 _THICK_VIEWS, _THICK_SIDE, _OPAQUE = 8, 256, 0.99
 VIEWS, SIDE, MOST_VOXELS, TRUNCATION, SIGMA, SURFELS = 64, 300, 256, 4.0, 1.0, 60_000
-"""Number of rendered views, most pixels of their sides, most voxels along the longest side, truncation and sigma
-of :mod:`tron.tracing.fusion`, most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
+"""Number of rendered views, most pixels of their sides, most voxels along the longest side, truncation and
+sigma of :mod:`tron.tracing.fusion`, most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
 _LEAST_SIDE, _PIXELS_PER_SPLAT = 64, 2.0
 _SOLID = 0.5
 _PITS = 3
@@ -309,7 +309,7 @@ class ProxiedTracer:
         return merged
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
-        """Return the scan's surfels at their centres, with normals and ``values`` of the nearest proxy surfels."""
+        """Return the scan's surfels at their centres, with normals and ``values`` of the proxy nearby."""
         found = centres(self._scan.records, dr.arange(mi.UInt32, len(self._scan.scene)))
         return replace(
             found, normal=mi.Normal3f(self._normals[0]), values=self._carried(values, self._sides[0])

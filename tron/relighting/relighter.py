@@ -112,7 +112,7 @@ class Relighter:
         self.meshes = Meshes(meshes, seed) if meshes else None
 
     def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
-        """Return the tracer for a camera; it is the same for all, unless surfels are turned towards the camera."""
+        """Return the tracer for a camera: one for all cameras, unless surfels are turned towards each."""
         seen = self._seen_by(camera)
         tracer = seen if self._proxied is None else self._proxied.showing(seen)
         return tracer if self._beside is None else BesideMeshes(tracer, self._beside)
@@ -217,7 +217,7 @@ class Relighter:
         return traced.sided(self.estimation.two_sided)
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
-        """Return the scene's M surfels at their centres, with the sides used for light and ``values`` of a bake."""
+        """Return the M surfels at their centres, with the sides used for light and ``values`` of a bake."""
         if self._proxied is not None:
             return self._proxied.surfels(values)
         count = len(self.scene)
@@ -504,7 +504,7 @@ class TracedFrame:
         return replace(frame, lit=lit, shadowed=frame.shadowed if self.estimation.bounces else lit)
 
     def images(self, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """Return only the (H, W, 3) buffers of :meth:`shade`, for a frame without sub-pixels and denoising."""
+        """Return (H, W, 3) buffers of :meth:`shade` alone, for a frame without sub-pixels and denoising."""
         colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.brdf)
         return self.view.images({name: colors[name] for name in names})
 

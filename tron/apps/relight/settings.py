@@ -41,17 +41,17 @@ if TYPE_CHECKING:
 else:
     BufferName = Literal[BUFFERS]
 LONGER_SIDE = 512
-"""Pixels of the longer side of a frame, unless the settings say it."""
+"""Default of the longer side of a frame, pixels."""
 
 ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
 T = TypeVar("T")
 DisplayOnly = Annotated[T, Field(json_schema_extra={"display_only": True})]
-"""A setting that no traced frame is made with: frames of a folder stay where it changes."""
+"""Type of a setting that affects no traced frame: after a change the frames of a folder are kept."""
 
 
 class Settings(BaseModel):
-    """Everything that tron-relight can be told."""
+    """All settings of tron-relight."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
