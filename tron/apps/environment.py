@@ -43,7 +43,7 @@ class Settings(BaseModel):
         0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
     )
     height: int | None = Field(
-        None, ge=4, le=16384, description="rows of the map; none: as many as there are, 512 of a ball"
+        None, ge=4, le=16384, description="rows of the map; none: as many as the file has, 512 for a ball"
     )
     layout: Literal["auto", "mirror_ball", "angular"] = Field(
         "auto", description="auto: told by the file; a square picture is a mirror ball or an angular map"
