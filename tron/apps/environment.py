@@ -40,7 +40,7 @@ class Settings(BaseModel):
         None, description="PNG to write, or to replace: the light, and a mirror and a white ball under it"
     )
     rotation: float = Field(
-        0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
+        0.0, description="rotation of the environment about up, degrees, counter-clockwise seen from above"
     )
     height: int | None = Field(
         None, ge=4, le=16384, description="rows of the map; none: as many as the file has, 512 for a ball"
