@@ -27,23 +27,25 @@ class Stage(BaseModel):
     frames: int = Field(default=1, ge=1, description="Frames K of a sample, 1 + 4n, consecutive in a clip.")
     steps: int = Field(
         ge=0,
-        description="Optimiser steps; with max_seconds, this stage's share of the time. 0 leaves it out.",
+        description="Optimiser steps; with max_seconds, this stage's share of the time. 0 skips the stage.",
     )
-    batch_size: int = Field(default=8, ge=1, description="Samples of a step, on each device.")
+    batch_size: int = Field(default=8, ge=1, description="Samples per step, on each device.")
     crop: int | None = Field(
         default=None, ge=8, description="Side of the random square crop, pixels; null trains on whole frames."
     )
     size: tuple[FrameSide, FrameSide] | None = Field(
         default=None,
-        description="Width and height, pixels: frames are made smaller, by means of areas, until they just "
-        "cover it, and a random window of it is taken (before the crop); validation takes the centre. "
-        "null: frames as they are.",
+        description="Width and height, pixels: frames are reduced by area averaging until they just cover "
+        "this size, then a random window of this size is taken, before the crop; validation "
+        "takes the centre. null: frames are not reduced.",
     )
     learning_rate: float = Field(
         default=1.0, gt=0, description="Factor on the optimizer's learning rates at the stage's peak."
     )
     final_learning_rate: float = Field(
-        default=0.01, gt=0, description="The same factor at the stage's end, after a cosine."
+        default=0.01,
+        gt=0,
+        description="Factor on the optimizer's learning rates at the stage's end, after a cosine.",
     )
     still_ratio: float = Field(
         default=0.0, ge=0, le=1, description="Share of a video stage's batches that hold single frames."

@@ -34,7 +34,7 @@ class OptimizerSettings(BaseModel):
     weight_decay: float = Field(default=1e-2, ge=0, description="AdamW's decoupled weight decay.")
     warmup_steps: int = Field(default=50, ge=0, description="Steps of linear warm-up in each stage.")
     gradient_clip: float | None = Field(
-        default=1.0, gt=0, description="Largest norm of the gradient; null: any."
+        default=1.0, gt=0, description="Largest norm of the gradient; null: no clipping."
     )
     ema_decay: float | None = Field(
         default=None,
@@ -55,14 +55,15 @@ class LossSettings(BaseModel):
     psnr: float = Field(
         default=0.0,
         ge=0,
-        description="Weight of the negative PSNR in dB, frame by frame: a good frame's errors count as "
-        "much as a bad one's, in proportion (the loss of NAFNet).",
+        description="Weight of the negative PSNR in dB, per frame: errors of a good frame count in "
+        "proportion as much as those of a bad frame (the loss of NAFNet).",
     )
     psnr_ceiling: float = Field(
         default=50.0,
         gt=0,
-        description="dB that the loss's PSNR nears and never reaches: nothing is gained beyond. Lower it "
-        "with data.mend, or samples that are right have all the say.",
+        description="dB that the PSNR of the loss approaches but never reaches, so that better frames "
+        "gain nothing. Lower it with data.mend; otherwise frames that are already right "
+        "dominate the loss.",
     )
     gradient: float = Field(
         default=0.0,
@@ -83,50 +84,52 @@ class DataSettings(BaseModel):
     cache_gb: float = Field(
         default=4.0,
         ge=0,
-        description="Keep decoded splits in memory up to this size, in each process; of larger ones each "
-        "sample reads its frames.",
+        description="Keep decoded splits up to this size in memory, in each process; for larger splits "
+        "each sample reads its frames.",
     )
     workers: int = Field(
         default=0, ge=0, description="Loader processes of splits that are not in memory; others use none."
     )
     flip: float = Field(default=0.5, ge=0, le=1, description="Probability of mirroring left and right.")
     permute_colors: float = Field(
-        default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, alike in all buffers."
+        default=0.0, ge=0, le=1, description="Probability of shuffling R, G and B, the same in all buffers."
     )
     tint: float = Field(
-        default=0.0, ge=0, description="Deviation of the logarithm of random gains on the light's R, G and B."
+        default=0.0,
+        ge=0,
+        description="Standard deviation of the logarithm of random gains on the light's R, G and B.",
     )
     exposure: float = Field(
         default=0.0,
         ge=0,
-        description="Deviation, in stops, of a random exposure that all linear buffers are given alike.",
+        description="Standard deviation, in stops, of a random exposure, the same for all linear buffers.",
     )
     rotate: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Probability of turning a sample by one, two or three quarters; by a half where it is no "
-        "square.",
+        description="Probability of rotating a sample: by one, two or three quarter turns if it is "
+        "square, else by a half turn.",
     )
     mix_lights: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Share of the samples that show their scene under two of its lights at once.",
+        description="Share of the samples that show their scene under a mix of two of its lights.",
     )
     mend: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Share of the samples whose lit is the truth (half of them) or lies between the "
-        "two, so that a network learns to leave what is right as it is.",
+        description="Share of the samples in which lit is replaced by the truth (half of them) or by a "
+        "mix of both, so that a network learns to leave correct input unchanged.",
     )
     damaged_limit: float = Field(
         default=0.01,
         ge=0,
         le=1,
-        description="Largest share of a stage's samples, counted over at least 1000, that may stand in for "
-        "damaged ones; beyond it the run ends.",
+        description="Largest share of damaged samples in a stage, counted over at least 1000; above it "
+        "the run ends.",
     )
 
 
@@ -139,9 +142,9 @@ class ValidationSettings(BaseModel):
 
     split: str | None = Field(
         default=DEFAULT,
-        description="Split to validate on; nothing is where it is null, or `validation` and not there.",
+        description="Split to validate on; null, or a missing split `validation`: no validation.",
     )
-    clips: int = Field(default=8, ge=1, description="How many of its clips, spread evenly over it.")
+    clips: int = Field(default=8, ge=1, description="Number of clips of the split, spread evenly over it.")
     every: int = Field(default=250, ge=1, description="Steps between validations.")
     pictures: int = Field(
         default=3,
@@ -151,7 +154,7 @@ class ValidationSettings(BaseModel):
     batch_pixels: int = Field(
         default=2**22,
         ge=1,
-        description="Pixels that go through the network at a time, all frames counted; a window of a stage's "
+        description="Pixels that go through the network at a time, over all frames; a window of a stage's "
         "K frames is never split.",
     )
 
@@ -176,8 +179,8 @@ class MemorySettings(BaseModel):
 
     checkpoint_activations: bool = Field(
         default=False,
-        description="Keep only what goes into each block of a transformer, and do the block again in the "
-        "backward pass: a third more time for a small part of the memory.",
+        description="Keep only the input of each transformer block and recompute the block in the "
+        "backward pass: a third more time for much less memory.",
     )
 
 
@@ -187,19 +190,19 @@ class Settings(BaseModel):
     model_config = ConfigDict(extra="forbid", frozen=True)
 
     dataset: DatasetPlace = Field(
-        description="Dataset folder that tron-datagen wrote, or its URL; or shards by name, read from their "
-        "beginning to their end: 'pipe:ssh host cat data/train-{00000..00003}.tar'."
+        description="Dataset folder that tron-datagen wrote, or its URL; or shards by name, read "
+        "sequentially: 'pipe:ssh host cat data/train-{00000..00003}.tar'."
     )
     splits: dict[str, str] = Field(
         default={},
-        description="Splits, by the names that stages and validation use, that come from another dataset: "
-        "FOLDER, or FOLDER#SPLIT where the split has another name there; FOLDER#A+B joins two.",
+        description="Splits that come from another dataset, by the names that stages and validation use: "
+        "FOLDER, or FOLDER#SPLIT if the split has another name there; FOLDER#A+B joins two.",
     )
     output_dir: Path = Field(
         description="Folder for renderer.safetensors, checkpoints, metrics.csv, config.yaml."
     )
     renderer: dict[str, Any] = Field(
-        description="What is trained, a `_target_` (group: tiny, unet, pixel_mlp, cosmos)."
+        description="The network to train, a `_target_` (group: tiny, unet, pixel_mlp, cosmos)."
     )
     start_from: Path | None = Field(
         default=None,
@@ -214,7 +217,7 @@ class Settings(BaseModel):
     validation: ValidationSettings = ValidationSettings()
     logger: list[LoggerName] = Field(
         default=["csv"],
-        description="Where progress is written: csv (metrics.csv, always), tensorboard, wandb (offline); in "
+        description="Loggers: csv (metrics.csv, always), tensorboard, wandb (offline); all write into "
         "output_dir.",
     )
     seed: int = Field(
@@ -230,24 +233,24 @@ class Settings(BaseModel):
     threads: int | None = Field(
         default=1,
         ge=1,
-        description="CPU threads of torch; 1 makes runs reproducible bit by bit, null leaves torch's.",
+        description="CPU threads of torch; 1 makes runs reproducible bit by bit, null keeps torch's default.",
     )
     accelerator: str = Field(default="auto", description="Lightning accelerator: auto, cpu, gpu.")
     devices: Annotated[int, Field(ge=1)] | Literal["auto"] = Field(
         default="auto",
-        description="Devices of this machine, each a process: a number, or auto: every GPU, one process on "
-        "the CPU.",
+        description="Number of devices of this machine, one process each; auto: every GPU, or one process "
+        "on the CPU.",
     )
     nodes: int = Field(
         default=1,
         ge=1,
-        description="Machines, with a command on each: by torchrun or srun.",
+        description="Number of machines; start the command on each, by torchrun or srun.",
     )
     precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
     strategy: Literal["auto", "ddp", "fsdp"] = Field(
         default="auto",
-        description="How several processes share the work: ddp (what auto means), each with all weights, or "
-        "fsdp, each with a share of the weights and of the optimiser's state.",
+        description="How processes share the work: ddp (auto means this) keeps all weights in each; fsdp "
+        "shards weights and optimiser state.",
     )
     memory: MemorySettings = MemorySettings()
     compile: bool = Field(default=False, description="Compile the transformer's blocks by torch.compile.")

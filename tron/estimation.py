@@ -11,7 +11,7 @@ Brdf = Literal["conserving", "lambert"]
 MATERIAL = "conserving"
 """The material of path tracing, which datasets and scenes name (:mod:`tron.brdf`)."""
 MATERIAL_BEFORE = "principled"
-"""That of Mitsuba, of datasets and scenes which name none: it loses light on rough metal."""
+"""Mitsuba's material, for datasets and scenes that name none; it loses light on rough metal."""
 
 
 def require_bounces(bounces: int, reflections: int) -> None:
@@ -26,8 +26,8 @@ def require_bounces(bounces: int, reflections: int) -> None:
 class Estimation(BaseModel):
     """Choices in estimating light (conventions.md, 10); by default 64 rays a pixel, unfiltered.
 
-    The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, brdf="lambert")``. What
-    each costs, on 10,000 to 20,000 surfels of scenes that no benchmark uses:
+    The paper's are ``Estimation(estimator="plain", two_sided=False, bounces=0, brdf="lambert")``. Costs of
+    each choice, on 10,000 to 20,000 surfels of scenes that no benchmark uses:
 
     * ``rays``: time grows with them. Their noise is below the bias of surfels from 16 on; 64 are converged.
       Of 0 shadows are as sharp as the surfels; where nothing bounces, and so nothing is baked, they are 2.
@@ -48,7 +48,7 @@ class Estimation(BaseModel):
         default=64,
         ge=0,
         multiple_of=2,
-        description="shadow rays per pixel, even; 0: the share of the light that was baked at the surfels",
+        description="shadow rays per pixel, even; 0: use the visibility that was baked at the surfels",
     )
     estimator: Estimator = Field(
         default="ratio",
@@ -62,17 +62,20 @@ class Estimation(BaseModel):
     filtered: bool = Field(default=False, description="edge-avoiding filter over the image")
     brdf: Brdf = Field(
         default="conserving",
-        description="conserving: the material that data are path-traced with, which sends out all the light "
-        "that it does not absorb; lambert: base color's diffuse part below a split sum, as in the paper",
+        description="conserving: the energy-conserving material with which data are path-traced; "
+        "lambert: diffuse base color below a split sum, as in the paper",
     )
     bounces: int = Field(
-        default=4, ge=0, le=16, description="times that light bounces between surfels; 0: direct light alone"
+        default=4,
+        ge=0,
+        le=16,
+        description="number of bounces of light between surfels; 0: direct light alone",
     )
     reflections: int = Field(
         default=0,
         ge=0,
-        description="rays per pixel that find what glossy surfaces mirror; 0: the bounced light around them, "
-        "and one ray for metals where filtered",
+        description="reflection rays per pixel for glossy surfaces; 0: bounced light around them instead, "
+        "and one ray for metals if filtered",
     )
     supersample: Literal[1, 2] = Field(
         default=1, description="2: 2 x 2 sub-pixels with a quarter of the rays each, averaged"
@@ -84,7 +87,7 @@ class Estimation(BaseModel):
         return self
 
     def of_sub_pixel(self) -> Estimation:
-        """The same for each of a pixel's sub-pixels, which share its rays out."""
+        """Return the estimation for one sub-pixel: the rays of a pixel are divided among its sub-pixels."""
         parts = self.supersample**2
         if parts == 1:
             return self
@@ -93,20 +96,20 @@ class Estimation(BaseModel):
         return self.model_copy(update={"rays": rays, "reflections": reflections, "supersample": 1})
 
     def of_pixels(self) -> Estimation:
-        """The same where light has to be found at pixels: with two rays instead of none."""
+        """Return an estimation that needs no baked visibility: two rays per pixel instead of none."""
         return self if self.rays else self.model_copy(update={"rays": 2})
 
 
 FINAL = Estimation()
-"""That of a frame at one sample a pixel; the settings of the commands take their defaults from it."""
+"""Estimation of a frame with one sample per pixel; settings of the commands have its defaults."""
 PREVIEW = Estimation(rays=0, filtered=True)
 """``quality=preview`` of tron-relight, its default."""
 FINEST = Estimation(filtered=True, reflections=4, supersample=2)
 """``quality=final`` of tron-relight."""
 QUALITY = {"preview": PREVIEW, "final": FINEST}
-"""By the name that ``quality=`` takes."""
+"""Estimation by the name that ``quality=`` takes."""
 
 OCTAVES = (-8.0, 4.0)
-"""Logarithms to base 2 of a pixel's footprint over the spacing of surfels that ``sampling`` tells apart."""
+"""Range of log2(pixel footprint / surfel spacing) that ``sampling`` encodes."""
 MOST_RAYS = 10.0
-"""Logarithm to base 2 of the shadow rays a pixel that ``sampling`` has as 1."""
+"""log2 of the number of shadow rays per pixel that ``sampling`` encodes as 1."""

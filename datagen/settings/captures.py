@@ -35,7 +35,9 @@ class SensorSettings(SettingsModel):
         gt=0,
         description="Electrons that the sensor counts where light times exposure is 1; middle grey is 0.18.",
     )
-    read_noise: float = Field(default=3.0, ge=0, description="Standard deviation of reading them, electrons.")
+    read_noise: float = Field(
+        default=3.0, ge=0, description="Standard deviation of the sensor's read noise, electrons."
+    )
 
 
 class ViewSettings(SettingsModel):
@@ -45,7 +47,7 @@ class ViewSettings(SettingsModel):
         default=["overcast", "studio", "sun"],
         min_length=1,
         max_length=64,
-        description="Light of each capture, in rotation, as in a split's lights.",
+        description="Lights of the captures, used in turn; the same choices as a split's lights.",
     )
     width: int = Field(default=128, ge=8, le=8192, description="View width in pixels.")
     height: int = Field(default=128, ge=8, le=8192, description="View height in pixels.")
@@ -59,22 +61,23 @@ class ViewSettings(SettingsModel):
         default=None,
         ge=1,
         le=10_000_000,
-        description="Also store about so many points on surfaces, with their colours, as photos would give.",
+        description="Also store about this number of points on surfaces, with colours, like structure "
+        "from motion.",
     )
     sensor: SensorSettings = Field(default=SensorSettings(), description="Camera of the photographs.")
     relights: list[LightChoice] = Field(
         default=[],
         max_length=16,
-        description="Other lights, as in a split's lights, under which the held-out views are path-traced as "
-        "well, into output_dir/relit: the truth of relighting.",
+        description="Other lights, as in a split's lights, under which held-out views are path-traced "
+        "into output_dir/relit: the truth for relighting.",
     )
-    relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of those.")
+    relight_spp: int = Field(default=144, ge=1, description="Paths per pixel of the relit views.")
     film_frames: int | None = Field(
         default=None,
         ge=1,
         le=10_000,
-        description="Show the lights of relights from so many places along the path of the scene's clips, "
-        "with true base color and normals, instead of from the held-out views.",
+        description="Render the lights of relights from this number of cameras along the path of the "
+        "scene's clips, with true base color and normals, instead of from the held-out views.",
     )
 
 
@@ -85,19 +88,20 @@ class CaptureSettings(ViewSettings):
         default=4,
         ge=1,
         le=1_000_000,
-        description="Captures that mode=captures makes, of as many test scenes.",
+        description="Number of captures that mode=captures makes, one per test scene.",
     )
     views: int = Field(
         default=64,
         ge=2,
         le=100_000,
-        description="Views of a capture from all sides; each 8th is held out, from the first.",
+        description="Views of a capture from all sides; every 8th is held out, starting with the first.",
     )
     photographs: bool = Field(
         default=False,
-        description="Take training views as photographs, each with its own exposure, white balance and noise "
-        "by sensor, by a camera that balances white for the light on what it sees and meters it as middle "
-        "grey; held-out views stay true renders in its colours, which reconstructions are judged by.",
+        description="Take training views as photographs: a camera balances white for the light on the "
+        "scene and meters it as middle grey; each photo has its own exposure, white balance "
+        "and noise, by sensor. Held-out views stay clean renders with the camera's colours, "
+        "for evaluation.",
     )
 
 
@@ -124,13 +128,13 @@ class LensSettings(SettingsModel):
         default=0.4,
         ge=0,
         le=16,
-        description="Standard deviation of the way that a hand shakes during a photo, pixels; the way is "
-        "straight, its direction any.",
+        description="Standard deviation of the camera shake during a photo, pixels; the shake is "
+        "straight, in a random direction.",
     )
     vignetting: Annotated[tuple[Corner, Corner], AfterValidator(_in_order)] = Field(
         default=(0.0, 0.15),
-        description="Least and greatest share of light that a capture's photos lack in their corners; it "
-        "grows with the square of the distance from the middle.",
+        description="Least and greatest loss of light in the corners of a capture's photos, as a share; "
+        "it grows with the square of the distance from the middle.",
         examples=["[0,0]"],
     )
 
@@ -145,14 +149,15 @@ class PoseNoise(SettingsModel):
         default=0.001,
         ge=0,
         le=0.2,
-        description="Standard deviation of a place along each axis, share of the capture's median distance "
-        "between camera and surface.",
+        description="Standard deviation of positions along each axis, as a share of the capture's median "
+        "distance between camera and surface.",
     )
     points: float = Field(
         default=0.002,
         ge=0,
         le=0.2,
-        description="Standard deviation of sparse points along each axis, share of that distance.",
+        description="Standard deviation of sparse points along each axis, as a share of the same median "
+        "distance.",
     )
 
 
@@ -161,13 +166,13 @@ class PseudoCaptureSettings(ViewSettings):
 
     views: Annotated[tuple[Count, Count], AfterValidator(_in_order)] = Field(
         default=(40, 60),
-        description="Least and greatest number of photos; each capture draws its own.",
+        description="Least and greatest number of photos; each capture draws a number between.",
         examples=["[8,8]"],
     )
     indoor_spp: int | None = Field(
         default=None,
         ge=1,
-        description="Paths per pixel in rooms, where most of them find no window; null: path_spp.",
+        description="Paths per pixel in rooms, where most paths find no window; null: path_spp.",
     )
     file: Literal["jpeg", "png"] = Field(
         default="jpeg", description="Format of the photos, 8 bits; JPEG of quality 92."
@@ -176,16 +181,16 @@ class PseudoCaptureSettings(ViewSettings):
         default=0.5,
         ge=0,
         le=1,
-        description="Probability that a capture's photos go through a filmic curve (AgX); others are clipped "
-        "at white and go through sRGB's.",
+        description="Probability that a capture's photos have a filmic curve (AgX); others are clipped at "
+        "white and have the sRGB curve.",
     )
     lens: LensSettings = Field(default=LensSettings(), description="Blur and vignetting of the photos.")
     masks: bool = Field(
         default=False,
-        description="Also store what is subject in each photo: masks/NAME.png, white where a surface covers "
-        "the pixel, exactly and from the true camera. Reconstruct with captured.photos.masks=subject.",
+        description="Also store exact masks of the subject: masks/NAME.png, white where a surface covers "
+        "the pixel, from the true camera. Reconstruct with captured.photos.masks=subject.",
     )
-    pose_noise: PoseNoise = Field(default=PoseNoise(), description="Errors of the named poses and points.")
+    pose_noise: PoseNoise = Field(default=PoseNoise(), description="Errors of the stored poses and points.")
 
 
 class Shares(SettingsModel):
@@ -193,9 +198,9 @@ class Shares(SettingsModel):
 
     train: float = Field(default=0.8, ge=0, description="First training split.")
     train_b: float = Field(
-        default=0.0, ge=0, description="Second training split, where a recipe of training asks for it."
+        default=0.0, ge=0, description="Second training split, for training recipes that use one."
     )
-    validation: float = Field(default=0.1, ge=0, description="Captures whose PSNR training shows.")
+    validation: float = Field(default=0.1, ge=0, description="Captures for the PSNR shown during training.")
     test: float = Field(default=0.1, ge=0, description="Held-out captures, for evaluation alone.")
 
 
@@ -207,56 +212,60 @@ class CapturedSettings(SettingsModel):
     )
     shares: Shares = Field(
         default_factory=lambda: Shares(),
-        description="Share of the captures in each split, every capture in one of them, drawn by seed and "
-        "name; each split with a share has a capture where there are enough, the largest shares first.",
+        description="Share of the captures in each split. Each capture is in one split, drawn by seed and "
+        "name. If there are enough captures, each split with a share has one, the largest "
+        "shares first.",
     )
     split_by_name: bool = Field(
         default=False,
-        description="A capture whose name begins with a split's, such as train-000003, is in that split, as "
-        "pseudo-captures are; shares say nothing then, and any other name is refused.",
+        description="Put a capture into the split that its name begins with, such as train-000003; "
+        "pseudo-captures have such names. Shares are then ignored, and any other name is "
+        "refused.",
     )
     relit: Path | None = Field(
         default=None,
-        description="Folder of path-traced views of the captures under other lights, relit/ of "
-        "pseudo-captures: reconstructions are lit by NAME_k_LIGHT/environment.exr as well, in the splits "
-        "train_relit, train_b_relit, validation_relit and test_relit.",
+        description="Folder of path-traced views of the captures under other lights (relit/ of "
+        "pseudo-captures): reconstructions are also lit by NAME_k_LIGHT/environment.exr, in "
+        "the splits train_relit, train_b_relit, validation_relit and test_relit.",
     )
     truth: Path | None = Field(
         default=None,
-        description="Folder of the captures' truth, truth/ of pseudo-captures: base color of relit clips is "
-        "brought to the scale of its maps, a factor a channel, which photos cannot tell; null: it stays as "
-        "the photos tell it.",
+        description="Folder of the captures' truth (truth/ of pseudo-captures): base color of relit clips "
+        "is scaled to its maps by one factor per channel, which photos do not determine; "
+        "null: not scaled.",
     )
     frames: int = Field(
-        default=5, ge=1, le=1000, description="Photos of a clip, neighbours in the order of their names."
+        default=5, ge=1, le=1000, description="Photos of a clip, consecutive in the order of their names."
     )
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(
         default=256,
         ge=8,
         le=8192,
-        description="Frame height in pixels. Photos are made smaller until they just cover a frame, and cut "
-        "at their edges; a capture of smaller photos fails.",
+        description="Frame height in pixels. Photos are reduced until they just cover a frame, then "
+        "cropped; a capture of smaller photos fails.",
     )
     balance: bool = Field(
         default=True,
-        description="Photos are shown as their capture's mean photo would: each divided by its own exposure "
-        "and white balance, which the surfels tell. false: as stored; the gains are in the metadata.",
+        description="Divide each photo by its exposure and white balance relative to the capture's mean "
+        "photo, estimated on the surfels. false: photos are stored as they are; the gains are "
+        "in the metadata.",
     )
     linear: bool = Field(
         default=False,
-        description="Photos become linear light, decoded by the curve that they are thought to have gone "
-        "through (sRGB; of path-traced ones AgX): training and evaluation then show them through AgX, like "
-        "all other data. false: display values, with the looks of their own curve.",
+        description="Decode photos to linear light by their assumed curve (sRGB; AgX for path-traced "
+        "views): training and evaluation then show them through AgX, like all other data. "
+        "false: display values, with the look of their own curve.",
     )
     guidance_spp: Rays = Field(
         default=64,
-        description="Shadow rays per pixel of the surfels' irradiance, even; preview or final as of splits.",
+        description="Shadow rays per pixel of the surfels' irradiance, even; preview or final as in splits.",
     )
     photos: PhotoSettings = Field(
         default_factory=lambda: PhotoSettings(test_every=0),
-        description="How captures are read, as by tron-reconstruct; max_side and downscale are those of the "
-        "reconstruction alone. test_every holds photos out of both, to judge surfels by, and breaks clips.",
+        description="How captures are read, as in tron-reconstruct; max_side and downscale concern the "
+        "reconstruction alone. test_every holds photos out of reconstruction and clips, to "
+        "evaluate surfels, and divides clips.",
     )
     prior: dict[str, Any] = Field(
         default_factory=lambda: {"_target_": "tron.reconstruction.Joint"},
@@ -264,16 +273,17 @@ class CapturedSettings(SettingsModel):
     )
     reconstruction: ReconstructionSettings = Field(
         default_factory=lambda: ReconstructionSettings(),
-        description="Surfels, as tron-reconstruct finds them; each capture has a seed of its own.",
+        description="Reconstruction of surfels, as in tron-reconstruct; each capture has a separate seed.",
     )
     reconstructed: Path | None = Field(
         default=None,
         description="Folder of a dataset of the same captures, made with the same seed, photos, prior, "
-        "reconstruction and light: what it found is taken over, and only guidance is made anew.",
+        "reconstruction and light: its reconstructions are reused, and only guidance is made "
+        "again.",
     )
     light: FitSettings = Field(
         default_factory=lambda: FitSettings(),
-        description="Fit of the light where the prior is not joint, likewise.",
+        description="Fit of the light, if the prior is not joint, as in tron-reconstruct.",
     )
 
     @model_validator(mode="after")

@@ -137,9 +137,11 @@ class EqualErrorSettings(SettingsModel):
     """Comparison of guidance with the path tracer, on the test scenes of a dataset."""
 
     reference_spp: int = Field(
-        default=1024, ge=2, multiple_of=2, description="Paths per pixel of what counts as the truth."
+        default=1024, ge=2, multiple_of=2, description="Paths per pixel of the reference."
     )
-    rounds: int = Field(default=3, ge=1, le=100, description="Times that each frame is rendered, in turns.")
+    rounds: int = Field(
+        default=3, ge=1, le=100, description="Number of times that each frame is rendered, in turns."
+    )
 
 
 def _listed(value: Any) -> list[Any]:
@@ -161,7 +163,7 @@ class Settings(ScaleSettings):
         "tracer takes to be as near the truth as guidance is (equal_error).",
     )
     seed: int = Field(
-        0, description="Root of all randomness; a scene depends on it, its split and its index alone."
+        0, description="Root of all randomness; a scene depends only on this seed, its split and its index."
     )
     source: Literal["synthetic", "captured"] = Field(
         "synthetic",
@@ -172,8 +174,8 @@ class Settings(ScaleSettings):
     )
     captures: Path | None = Field(
         None,
-        description="Local folder with a capture a sub-folder, whatever tron-reconstruct reads, for "
-        "source=captured.",
+        description="Local folder with one sub-folder per capture, in any format that tron-reconstruct "
+        "reads, for source=captured.",
     )
     captured: CapturedSettings = Field(
         default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
@@ -184,17 +186,18 @@ class Settings(ScaleSettings):
     )
     validation: SplitSettings = Field(
         SplitSettings(scenes=2, lights=["any"] * 2),
-        description="Scenes whose PSNR training shows; nothing is trained on them.",
+        description="Scenes for the PSNR shown during training; networks are not trained on them.",
     )
     test: SplitSettings = Field(
         SplitSettings(scenes=4, lights=[], reference_buffers=True),
         description="Held-out scenes under held-out lights, for evaluation alone: training never reads them.",
     )
     capture: CaptureSettings = Field(
-        CaptureSettings(), description="Captures to reconstruct, of the test scenes."
+        CaptureSettings(), description="Captures of the test scenes, to reconstruct."
     )
     pseudo_capture: PseudoCaptureSettings = Field(
-        PseudoCaptureSettings(), description="Captures whose truth is hidden, of the splits' scenes."
+        PseudoCaptureSettings(),
+        description="Pseudo-captures of the splits' scenes, with the truth in separate folders.",
     )
     equal_error: EqualErrorSettings = Field(
         EqualErrorSettings(), description="Comparison of guidance with the path tracer."
@@ -204,8 +207,7 @@ class Settings(ScaleSettings):
     )
     objects: tuple[int, int] | None = Field(
         None,
-        description="Least and greatest number of objects of a scene, such as [2,4]; null takes the style's "
-        "own.",
+        description="Least and greatest number of objects of a scene, such as [2,4]; null: as in the style.",
         examples=["[2,4]"],
     )
     families: list[Family] | None = Field(
@@ -216,13 +218,13 @@ class Settings(ScaleSettings):
         examples=["[sun,overcast]"],
     )
     views: Annotated[int, Field(ge=1)] | Auto = Field(
-        AUTO, description="Views whose G-buffers the surfels are made from; auto: as surfels."
+        AUTO, description="Number of views whose G-buffers the surfels are made from; auto: as for surfels."
     )
     view_width: Annotated[int, Field(ge=8, le=8192)] | Auto = Field(
-        AUTO, description="Width of those views in pixels; auto: as surfels."
+        AUTO, description="Width of these views in pixels; auto: as for surfels."
     )
     view_height: Annotated[int, Field(ge=8, le=8192)] | Auto = Field(
-        AUTO, description="Height of those views in pixels; auto: as surfels."
+        AUTO, description="Height of these views in pixels; auto: as for surfels."
     )
     surfels: Annotated[int, Field(ge=100)] | Auto = Field(
         AUTO,
@@ -232,16 +234,16 @@ class Settings(ScaleSettings):
     )
     refine_steps: Annotated[int, Field(ge=0, le=100_000)] | Auto = Field(
         AUTO,
-        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0 takes them as made; "
-        "auto: as surfels.",
+        description="Optimisation steps that fit a scene's surfels to its G-buffers; 0: no fit; auto: as "
+        "for surfels.",
     )
     surfels_from: SurfelSources = Field(
         SurfelSources(),
-        description="What scenes' surfels are made from: gbuffers, reconstruction, or shares of the scenes.",
+        description="Source of the surfels of scenes: gbuffers, reconstruction, or shares of both.",
         examples=["{gbuffers: 3, reconstruction: 1}"],
     )
     surfel_reconstruction: SurfelReconstruction = Field(
-        SurfelReconstruction(), description="Reconstruction of surfels, where they are made by it."
+        SurfelReconstruction(), description="Settings of the reconstruction of surfels, for surfels_from."
     )
     estimator: Estimator = Field(
         FINAL.estimator,
@@ -255,19 +257,19 @@ class Settings(ScaleSettings):
     )
     brdf: Brdf = Field(
         FINAL.brdf,
-        description="Material that the surfels are shaded with: conserving, as the path tracer's; lambert, "
-        "as in the paper.",
+        description="Material of the surfels in shading: conserving, as in the path tracer; lambert, as "
+        "in the paper.",
     )
     bounces: int = Field(
         FINAL.bounces,
         ge=0,
         le=16,
-        description="Times that light bounces between the surfels in lit; 0: lit is direct light alone.",
+        description="Number of bounces of light between surfels in lit; 0: lit is direct light alone.",
     )
     reflections: int = Field(
         FINAL.reflections,
         ge=0,
-        description="Rays per pixel that find what glossy surfels mirror; 0: the bounced light around them.",
+        description="Reflection rays per pixel for glossy surfels; 0: bounced light around them instead.",
     )
     supersample: Literal[1, 2] = Field(
         FINAL.supersample,
@@ -283,10 +285,10 @@ class Settings(ScaleSettings):
         None,
         gt=0,
         le=4096,
-        description="Texels a world unit of the textures on procedural pieces; null: two along a pixel of "
-        "frames and views at the median distance of cameras and things. A scene has 64 for each pixel of a "
-        "frame at most, between one and eight million; where those are too few, the log says how many a unit "
-        "they are.",
+        description="Texels per world unit of the textures on procedural pieces; null: two per pixel of "
+        "frames and views, at the median distance between cameras and objects. A scene has at "
+        "most 64 texels per pixel of a frame, between one and eight million in all; if this "
+        "limits the density, the log gives it.",
     )
     environment_height: int = Field(
         256, ge=8, le=8192, description="Rows of the lat-long maps that lights are baked to."
@@ -296,41 +298,41 @@ class Settings(ScaleSettings):
         default_factory=list, description="Names of the assets to use; empty: all in the folder."
     )
     asset_share: float = Field(
-        1.0, ge=0, le=1, description="Share of objects drawn from assets, where given."
+        1.0, ge=0, le=1, description="Share of objects drawn from assets, if assets is given."
     )
     textures: Path | None = Field(
-        None, description="Folder of PBR texture sets to lay on procedural pieces whose role they suit."
+        None, description="Folder of PBR texture sets for procedural pieces with a matching role."
     )
     texture_share: float = Field(
-        0.5, ge=0, le=1, description="Share of pieces with a texture set, among those that one suits."
+        0.5, ge=0, le=1, description="Share of pieces with a texture set, among pieces with a matching set."
     )
     environments: Path | None = Field(None, description="Folder of .hdr and .exr maps to use as lights.")
     map_share: float = Field(
         1.0,
         ge=0,
         le=1,
-        description="Share of lights drawn from environments, where given, of those that any or a contrast "
-        "asks for.",
+        description="Share of lights drawn from environments, if given, among lights that any or a "
+        "contrast asks for.",
     )
     share_models: bool = Field(
         False,
-        description="All models and texture sets serve every split; false: every fourth of each serves the "
-        "test split alone, where there are four.",
+        description="All models and texture sets are used in every split; false: every fourth is for the "
+        "test split alone, if there are four.",
     )
     checklist: str | None = Field(
         None,
-        description="Named maps and models of a benchmark, a YAML file or tron_synth: of environments those "
-        "alone are used; for what is missing something procedural stands in, by share, and mode=plan lists "
-        "it.",
+        description="Named maps and models of a benchmark, a YAML file or tron_synth: of environments "
+        "only these are used. Procedural ones stand in for missing files, by share, and "
+        "mode=plan lists them.",
     )
     disjoint_from: list[Path] = Field(
         default_factory=list,
-        description="Folders of datasets that are trained on: a model, texture or map of theirs, by hash, or "
-        "a scene is refused before any is made; with mode=validate it is a problem.",
+        description="Folders of training datasets: a model, texture or map in common, by hash, or a scene "
+        "in common is refused before any scene is made; with mode=validate it is a problem.",
     )
     share_maps: bool = Field(
         False,
-        description="All maps light every split; false: every fourth lights the test split alone, where "
+        description="All maps light every split; false: every fourth lights the test split alone, if "
         "there are four.",
     )
     catalogue: Path | None = Field(
@@ -339,8 +341,8 @@ class Settings(ScaleSettings):
     )
     allow_unlicensed: Literal["all"] | list[str] = Field(
         default_factory=list,
-        description="Names of models, textures and maps to use although the catalogue has no licence; all: "
-        "every one.",
+        description="Names of models, textures and maps to use without a licence in the catalogue; all: "
+        "every file.",
     )
     only: list[str] = Field(default_factory=list, description="Make these scenes only, such as train-000012.")
     variety_against: Path | None = Field(
@@ -359,25 +361,25 @@ class Settings(ScaleSettings):
         description="Worker processes of the cluster; null: one per core with cluster=local.",
     )
     worker_timeout: float = Field(
-        600.0, gt=0, description="Seconds to wait for the cluster's first worker: jobs may queue for long."
+        600.0, gt=0, description="Seconds to wait for the cluster's first worker; jobs may queue for long."
     )
     recycle_after: int = Field(
         50,
         ge=1,
-        description="Scenes a worker makes before it restarts, since Mitsuba's memory grows; not with "
-        "cluster=address.",
+        description="Number of scenes after which a worker restarts, because Mitsuba's memory grows; not "
+        "with cluster=address.",
     )
     scene_timeout: float | None = Field(
         None,
         gt=0,
-        description="Seconds after which a scene fails and its worker is replaced; null: 20 times what "
-        "mode=plan says of it, 600 at the least, and a day for captures that are rendered. Not with "
-        "cluster=none.",
+        description="Seconds after which a scene fails and its worker is replaced; null: 20 times the "
+        "estimate of mode=plan for it, at least 600, and a day for captures that are "
+        "rendered. Not with cluster=none.",
     )
     cluster: dict[str, Any] | None = Field(
         None,
-        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` lists "
-        "its keys, conf/datagen/cluster says what they mean.",
+        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` "
+        "lists the keys of a cluster, conf/datagen/cluster explains them.",
     )
 
     @field_validator(*SPLITS, mode="wrap")

@@ -28,53 +28,55 @@ class SplitSettings(SettingsModel):
         | Annotated[dict[str, PositiveInt], Field(min_length=1)]
     ) = Field(
         default="table",
-        description="What stands in a scene, on what, and how it is filmed. Scenes take those of a list in "
-        "turns; {object: 15, table: 25} makes the first 15 scenes of one and the next 25 of another.",
+        description="Objects of a scene, what they stand on, and the camera path. Styles in a list "
+        "alternate; {object: 15, table: 25} gives the first 15 scenes one style and the next "
+        "25 another.",
         examples=["[mixed,table]"],
     )
     things: list[ThingName] = Field(
         default=[],
-        description="Kinds of procedural objects, each as likely as another, in place of the style's own; [] "
-        "leaves them to the style.",
+        description="Kinds of procedural objects, equally likely, instead of the style's kinds; []: as in "
+        "the style.",
         examples=["[vase,mug,book]"],
     )
     materials: list[ProceduralName] = Field(
         default=[],
-        description="Families of procedural materials, of things and of what they stand on: those that suit "
-        "a piece, or any of these where none does; [] takes all.",
+        description="Families of procedural materials, for objects and for what they stand on: those that "
+        "suit a piece, or any of these if none does; []: all.",
         examples=["[paint,plastic,metal]"],
     )
     lights: list[LightChoice] = Field(
         default=["any"] * 4,
         max_length=64,
-        description="Light of each clip of a scene, one clip for each in the list. any draws one of "
-        "families; high, medium and low draw one of such contrast; hdri takes one of the maps in "
-        "environments. [], of test alone: three of environments where it is given, else a sun, a studio and "
-        "an overcast sky.",
+        description="Light of each clip of a scene, one clip per entry. any draws from families; high, "
+        "medium and low draw a light of this contrast; hdri takes a map of environments. [], "
+        "in test alone: three maps of environments if given, else a sun, a studio and an "
+        "overcast sky.",
     )
     lights_share_path: bool = Field(
         default=True,
-        description="All clips of a scene show it from the same cameras: each frame is path-traced under all "
-        "lights at once, which share its paths, rays and G-buffers. false: each clip begins at a place of "
-        "its own.",
+        description="All clips of a scene have the same cameras: each frame is path-traced under all "
+        "lights at once, with shared paths, rays and G-buffers. false: each clip begins at "
+        "another place.",
     )
     moving_objects: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Share of scenes in whose clips an object is lifted and turned; their frames cost more.",
+        description="Share of scenes in whose clips an object is lifted and turned; such frames cost more.",
     )
     moving_lights: float = Field(
         default=0.0,
         ge=0,
         le=1,
-        description="Share of lights that turn about the zenith within their clip; their frames cost more.",
+        description="Share of lights that turn about the zenith during their clip; such frames cost more.",
     )
     still_camera: bool = Field(
         default=False,
-        description="All frames of a clip are seen from the place of its first: what changes is what moves.",
+        description="All frames of a clip have the camera of its first frame, so only moving objects and "
+        "lights change.",
     )
-    frames: int = Field(default=5, ge=1, le=1000, description="Consecutive frames of a clip.")
+    frames: int = Field(default=5, ge=1, le=1000, description="Number of consecutive frames of a clip.")
     width: int = Field(default=256, ge=8, le=8192, description="Frame width in pixels.")
     height: int = Field(default=256, ge=8, le=8192, description="Frame height in pixels.")
     path_spp: int = Field(
@@ -84,26 +86,27 @@ class SplitSettings(SettingsModel):
     )
     window_of: list[Annotated[int, Field(ge=8, le=8192)]] = Field(
         default=[],
-        description="Widths, in pixels, of pictures that frames are windows of, width x height pixels about "
-        "something that is seen: many scales for the price of small frames. [] takes whole pictures.",
+        description="Widths, in pixels, of larger pictures of which frames are windows, width x height "
+        "pixels around a visible object: many scales at the cost of small frames. []: frames "
+        "are whole pictures.",
         examples=["[128,256,512,1024]"],
     )
     window_each: Literal["clip", "frame"] = Field(
         default="clip",
-        description="What draws a size and a place of window_of: a clip, whose frames are neighbours, or "
-        "each of its frames, where they are none.",
+        description="What shares one size and place of window_of: a clip of neighbouring frames, or each "
+        "frame separately.",
     )
     guidance_spp: Rays | Annotated[list[Rays], Field(min_length=1)] = Field(
         default=64,
-        description="Shadow rays per pixel of the surfels' irradiance, even; preview or final are the rays, "
-        "the filter, the sub-pixels and the reflections of that quality of tron-relight. Of a list each clip "
-        "of a scene has one in turn.",
+        description="Shadow rays per pixel of the surfels' irradiance, even; preview and final are the "
+        "rays, filter, sub-pixels and reflections of these qualities of tron-relight. Clips "
+        "of a scene use the entries of a list in turn.",
         examples=["[preview,8,32,final]"],
     )
     reference_buffers: bool = Field(
         default=False,
-        description="Also store Mitsuba's direct irradiance, with and without shadows, base color, normals, "
-        "depth, roughness and metallic, and the surfels' own.",
+        description="Also store Mitsuba's direct irradiance, with and without shadows, and base color, "
+        "normals, depth, roughness and metallic, true and of the surfels.",
     )
     reference_spp: int = Field(
         default=128, ge=2, description="Shadow rays per pixel of Mitsuba's direct irradiance."

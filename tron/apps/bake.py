@@ -43,7 +43,7 @@ class Settings(BaseModel):
         description=f"file to write, or to replace, not the scene's own: {', '.join(WRITTEN)}"
     )
     rotation: float = Field(
-        0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
+        0.0, description="rotation of the environment about up, degrees, counter-clockwise seen from above"
     )
     exposure: Literal["auto"] | Annotated[float, Field(gt=0)] = Field(
         "auto",
@@ -52,7 +52,7 @@ class Settings(BaseModel):
     look: Look = Field("photograph", description="tone: AgX with the contrast that photographs have, or none")
     surroundings: Treatment = Field("drop", description=SURROUNDINGS)
     proxy: Literal["auto", "always", "never"] = Field(
-        "auto", description="what light sees of a scan, as of tron-relight"
+        "auto", description="whether light is computed on a proxy of the scan, as in tron-relight"
     )
     projection: SeenAs = "auto"
     materials: FoundMaterials = "auto"

@@ -39,8 +39,8 @@ class Settings(BaseModel):
         description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats; it stays as it is"
     )
     edits: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
-        description="YAML with a list of edits, done in their order; several files, [a.yaml,b.yaml], are "
-        "merged where no object is named in two",
+        description="YAML with a list of edits, done in order; several files, [a.yaml,b.yaml], are merged "
+        "if no object is named in two",
         examples=["[a.yaml,b.yaml]"],
     )
     output: Path = Field(description="PLY to write, or to replace; not the scene's own")

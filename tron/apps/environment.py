@@ -40,10 +40,10 @@ class Settings(BaseModel):
         None, description="PNG to write, or to replace: the light, and a mirror and a white ball under it"
     )
     rotation: float = Field(
-        0.0, description="turn of the environment about up, degrees, counter-clockwise seen from above"
+        0.0, description="rotation of the environment about up, degrees, counter-clockwise seen from above"
     )
     height: int | None = Field(
-        None, ge=4, le=16384, description="rows of the map; none: as many as there are, 512 of a ball"
+        None, ge=4, le=16384, description="rows of the map; none: as many as the file has, 512 for a ball"
     )
     layout: Literal["auto", "mirror_ball", "angular"] = Field(
         "auto", description="auto: told by the file; a square picture is a mirror ball or an angular map"
@@ -53,7 +53,7 @@ class Settings(BaseModel):
         description="column and row of the ball's centre and its radius, pixels; none: the picture's middle",
     )
     distance: float = Field(
-        100.0, gt=1, description="of the camera from the mirror ball's centre, in radii of the ball"
+        100.0, gt=1, description="distance of the camera from the mirror ball's centre, in radii of the ball"
     )
 
     @model_validator(mode="after")

@@ -51,8 +51,8 @@ class Settings(BaseModel):
         "(nerfstudio's), images.txt (COLMAP's), or a .glb or .usda with one camera that moves, upright",
     )
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of cameras that move")
-    triangles: int = Field(60_000, ge=100, le=5_000_000, description="of a mesh, at most")
-    texture: int = Field(2048, ge=64, le=8192, description="pixels of a side of a mesh's textures")
+    triangles: int = Field(60_000, ge=100, le=5_000_000, description="maximum number of triangles of a mesh")
+    texture: int = Field(2048, ge=64, le=8192, description="side of a mesh's textures in pixels")
     projection: SeenAs = "auto"
     up: Up = None
     variant: Variant = "llvm_ad_rgb"

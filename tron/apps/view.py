@@ -40,15 +40,13 @@ class Settings(BaseModel):
     )
     light: str | None = Field(
         None,
-        description="the map to begin with, by its name without suffix; null: the light of the capture, else "
-        "the brightest of the first 8",
+        description="the first map, by its name without suffix; null: the light of the capture, else the "
+        "brightest of the first 8",
     )
     models: Path | None = Field(None, description="folder of PLYs that may be inserted; null: none")
-    output_dir: Path = Field(
-        Path("outputs/view"), description="folder that pictures, scenes and edits are saved in"
-    )
+    output_dir: Path = Field(Path("outputs/view"), description="folder for saved pictures, scenes and edits")
     host: str = Field(
-        "127.0.0.1", description="address to listen on; 0.0.0.0 lets in everybody who reaches it"
+        "127.0.0.1", description="address to listen on; 0.0.0.0 lets everybody on the network in"
     )
     port: int = Field(8080, ge=1, le=65535, description="port to listen on")
     ground: GroundChoice = Field("auto", description=GROUND)

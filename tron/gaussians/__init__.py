@@ -1,4 +1,4 @@
-"""Gaussian scenes: the surfels, their harmonics, their files, and how they are made from G-buffers."""
+"""Gaussian scenes: surfels, their spherical harmonics and files, and how to make them from G-buffers."""
 
 from tron.gaussians.scene import GaussianScene
 

@@ -139,7 +139,7 @@ class GaussianScene:
         return low, high
 
     def facing(self, point: np.ndarray) -> GaussianScene:
-        """The scene with every surfel's normal on the side of a point (3,), world."""
+        """Return the scene with all normals turned to the side of a point (3,), world."""
         return self.turned_over(self.looks_away(point))
 
     def looks_away(self, point: np.ndarray) -> np.ndarray:
@@ -156,7 +156,7 @@ class GaussianScene:
         return replace(self, quats=np.where(which[:, None], turned, self.quats))
 
     def rotated(self, rotation: np.ndarray) -> GaussianScene:
-        """The scene turned about the origin by a (3, 3) rotation: centres, frames, radiance and up.
+        """Rotate the scene about the origin by a (3, 3) rotation: centres, frames, radiance and up.
 
         A mirror image, of determinant -1, is one too: tangents u are turned over, so that frames stay
         right-handed and normals are mirrored.
@@ -173,12 +173,12 @@ class GaussianScene:
         )
 
     def upright(self) -> GaussianScene:
-        """The scene turned about the origin the shortest way so that ``up`` is +z, as in environment maps."""
+        """Rotate the scene the shortest way about the origin so that ``up`` is +z, as in environment maps."""
         turn = upright(self.up)
         return self if np.allclose(turn, np.eye(3)) else self.rotated(turn)
 
     def validate(self, where: str | Path | None = None) -> GaussianScene:
-        """Return the scene itself if it is whole; raise TronError naming the first field that is not.
+        """Return the scene itself if it is valid; raise TronError naming the first invalid field.
 
         `where`, the file the scene comes from, is added to the message.
         """

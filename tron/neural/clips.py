@@ -1,4 +1,4 @@
-"""Clips: the windows that a renderer draws them in, and frames averaged along exact motion. Loads no torch.
+"""Clips: windows of frames for a renderer, and averages of frames along exact motion. Loads no torch.
 
 Rays that differ from frame to frame, edges that fall on pixels otherwise each time, what a network makes of
 both: it flickers, and the mean over frames is nearer to the truth than each of them. A neighbour's picture is
@@ -20,9 +20,9 @@ import numpy as np
 from tron.errors import TronError
 
 DEVIATIONS = 1.0
-"""Standard deviations of the colours around a pixel that others may be off their mean."""
+"""Variance clipping: most standard deviations from the mean colour around a pixel."""
 OWN_WEIGHT = 2.0
-"""Weight of a frame's own picture where a neighbour's has 1."""
+"""Weight of the frame itself; a neighbour has weight 1."""
 Motion = Callable[[int, int], tuple[np.ndarray, np.ndarray]]
 """Frame and other frame of a clip, by number -> where each pixel's surface is in the other frame:
 
@@ -34,7 +34,7 @@ Motion = Callable[[int, int], tuple[np.ndarray, np.ndarray]]
 def averaged_frames(
     pictures: Iterable[np.ndarray], frames: int, size: int, motion: Motion, overlap: Overlap = "anchor"
 ) -> Iterator[np.ndarray]:
-    """Frames of a clip, each averaged with others near it, in the memory of ``size`` frames.
+    """Average each frame of a clip with its neighbours, in the memory of ``size`` frames.
 
     Args:
         pictures: of the clip, in order, (H, W, 3) display values in [0, 1].
@@ -57,7 +57,7 @@ def averaged_frames(
 
 
 def averaged(pictures: Mapping[int, np.ndarray], index: int, motion: Motion) -> np.ndarray:
-    """A frame's picture and those of other frames, brought to its pixels: their mean.
+    """Return the mean of a frame and of other frames that were warped to its pixels.
 
     Args:
         pictures: by number in the clip, (H, W, 3) display values in [0, 1].
@@ -109,13 +109,13 @@ def _bounds(picture: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 #     mean    all of them: their mean
 
 TEMPORAL_FACTOR = 4
-"""Frames of a latent frame after the first, which holds one, of the codecs that compress time."""
+"""Frames per latent frame in codecs that compress time; the first latent frame holds one."""
 
 Overlap = Literal["newest", "mean", "anchor"]
 
 
 class Window(NamedTuple):
-    """One pass: frames of the clip that go through the network, and those of them that are kept."""
+    """One pass: frames of the clip that go through the network, and frames that are kept."""
 
     frames: range
     kept: range
@@ -132,7 +132,7 @@ def check_frames(frames: int, temporal_factor: int = TEMPORAL_FACTOR) -> None:
 def windows(
     frames: int, size: int, temporal_factor: int = TEMPORAL_FACTOR, overlap: Overlap = "anchor"
 ) -> list[Window]:
-    """Passes over a clip, in order; every frame is kept at least once, and once but for the mean.
+    """Return passes over a clip, in order; each frame is kept once, with overlap=mean at least once.
 
     Stride 1, as the paper has it; a clip shorter than the window is cut into the largest windows that fit.
     Raises TronError for another overlap.

@@ -1,4 +1,4 @@
-"""Settings of the neural renderers; they travel inside the weights file. Loads no torch.
+"""Settings of the neural renderers, stored in the weights file. Loads no torch.
 
 ``--help`` and ``--cfg`` of tron-train show them, so that neither waits for torch and diffusers.
 """
@@ -26,9 +26,9 @@ PAPER_GUIDANCE = ("pbr", "irradiance")
 """Guidance of the paper's network: direct light alone."""
 AUTO = "auto"
 MEAN = "mean"
-"""Start of a network that adds to the mean of all latents."""
+"""Value of ``skip`` for a network that starts from the mean of all latents."""
 BEST_FIRST = ("lit", "pbr")
-"""Buffers that a network starts from unless told otherwise: the first of them that it is given."""
+"""Default start buffers: the first of these among the network's guidance."""
 
 
 def check_weights(weights: Mapping[str, float], guidance: Sequence[str]) -> None:
@@ -50,7 +50,7 @@ def check_sizes(weights: Mapping[str, float]) -> None:
 
 
 class GuidedConfig(BaseModel):
-    """Settings of every renderer; they travel inside the weights file."""
+    """Settings of every renderer, stored in the weights file."""
 
     model_config = ConfigDict(extra="forbid", frozen=True)
 
@@ -90,7 +90,7 @@ class GuidedConfig(BaseModel):
 
 
 class BackboneConfig(BaseModel):
-    """Shape of a CosmosTransformer3DModel; the defaults are the tiny one that trains in minutes on a CPU.
+    """Shape of a CosmosTransformer3DModel; the defaults give a tiny model that trains in minutes on a CPU.
 
     Attributes:
         padding_channel: the published weights expect a padding mask as one more input channel; it is always
@@ -179,7 +179,7 @@ AnyBackbone = Annotated[
 
 
 class RendererConfig(GuidedConfig):
-    """Parts of a NeuralRenderer; it travels inside the weights file. ``skip`` may be mean: of all latents."""
+    """Parts of a NeuralRenderer, stored in the weights file. ``skip=mean`` starts from the latents' mean."""
 
     OTHER_STARTS: ClassVar[tuple[str, ...]] = (MEAN,)
 
@@ -277,7 +277,7 @@ COSMOS_0_6B = BackboneConfig(
 
 
 class CosmosConfig(RendererConfig):
-    """Renderer of the paper: published backbone and codec, one step at its noise level, five frames."""
+    """The paper's renderer: published backbone and codec, one step at its noise level, five frames."""
 
     guidance: tuple[str, ...] = PAPER_GUIDANCE
     skip: str = MEAN
@@ -289,7 +289,7 @@ class CosmosConfig(RendererConfig):
 
 
 class UNetRendererConfig(RendererConfig):
-    """Renderer of a UNet on the pixels themselves."""
+    """Settings of a renderer with a UNet on pixels."""
 
     codec: str = "pixels"
     backbone: UNetConfig = UNetConfig()

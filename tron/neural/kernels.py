@@ -1,4 +1,4 @@
-"""Filters of a picture whose kernels are Gaussian or a network's, one for each pixel.
+"""Filters of a picture with a kernel for each pixel, Gaussian or predicted by a network.
 
 Guidance is sampled once in a pixel, a photograph is a mean over it: whatever starts from a buffer of guidance
 does well to filter it first. Kernels that a network predicts are those of Bako et al., "Kernel-Predicting
@@ -27,7 +27,7 @@ def gaussian_logits(deviation: float, side: int) -> Tensor:
 
 
 def filtered(video: Tensor, weights: Tensor, step: int = 1) -> Tensor:
-    """Weighted sum of each pixel's neighbours; beyond the border the edge goes on.
+    """Return the weighted sum of each pixel's neighbours; the border is replicated.
 
     Args:
         video: (B, C, K, H, W).

@@ -1,4 +1,4 @@
-"""Classes of renderers by the names that weights files give them: ours, and those of installed packages.
+"""Renderer classes by their names in weights files: our classes, and classes of installed packages.
 
 A file names its class and never has it imported. Found are those that its reader has imported already, and
 those that a package he installed declares as an entry point of the group `tron.networks`.
@@ -22,7 +22,7 @@ OURS: dict[str, type[Renderer]] = {"neural": NeuralRenderer, "pixel_mlp": PixelM
 
 
 def kind_of(renderer: Renderer) -> str:
-    """Name of a renderer's class in a weights file: one of ours, or MODULE:CLASS.
+    """Return the name of a renderer's class for weights files: a short name for ours, else MODULE:CLASS.
 
     Raises:
         TronError: no reader could find the class, since a module does not have it by that name.
@@ -41,7 +41,7 @@ def kind_of(renderer: Renderer) -> str:
 
 
 def renderer_class(kind: str, where: Path | None = None) -> type[Renderer]:
-    """The class that a weights file names.
+    """Return the class that a weights file names.
 
     Args:
         kind: as `kind_of` has it.
@@ -71,7 +71,7 @@ def renderer_class(kind: str, where: Path | None = None) -> type[Renderer]:
 
 
 def config_class(cls: type[Renderer]) -> type[GuidedConfig]:
-    """Class of a renderer's settings: the type of its attribute `config`."""
+    """Return the class of a renderer's settings: the type of its attribute `config`."""
     return get_type_hints(cls)["config"]
 
 

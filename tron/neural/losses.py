@@ -64,7 +64,7 @@ class RendererLoss:
 
 
 def gradient_error(predicted: Tensor, target: Tensor) -> Tensor:
-    """Mean |D predicted - D target|, D the difference of neighbours: along rows plus along columns (scalar).
+    """Return mean |D predicted - D target| with D the difference of neighbours, rows plus columns (scalar).
 
     The L1 loss of gradients of Chaitanya et al., "Interactive Reconstruction of Monte Carlo Image Sequences
     using a Recurrent Denoising Autoencoder" (2017), with neighbours' differences in place of a Laplacian of a
@@ -78,7 +78,7 @@ def gradient_error(predicted: Tensor, target: Tensor) -> Tensor:
 
 
 def psnr_per_frame(predicted: Tensor, target: Tensor, mask: Tensor | None = None) -> Tensor:
-    """PSNR in dB of the display values in [0, 1] that (B, 3, K, H, W) in [-1, 1] stand for -> (B, K).
+    """Return the PSNR in dB per frame, (B, K), of (B, 3, K, H, W) in [-1, 1] as display values in [0, 1].
 
     The prediction is clamped; mask (B, 1, K, H, W) selects pixels, and a frame without any gives NaN.
     """

@@ -1,4 +1,4 @@
-"""What ``checkpoint=auto`` draws pictures by: what gains most on validation scenes, by size and quality.
+"""Choice of ``checkpoint=auto``: the way with the largest gain on validation scenes, by size and quality.
 
 GAINS are foreground PSNR less that of ``lit`` on procedural scenes that neither trained nor judge a network:
 lower ends of the intervals over scenes (95 % of six at 128, the worst of four and two at 256 and 512), for
@@ -18,7 +18,7 @@ Quality = Literal["preview", "final"]
 Way = str
 """:data:`NETWORK`, or the name of a denoiser (:mod:`tron.denoising`); a third way is ``lit`` as it is."""
 NETWORK: Way = "network"
-"""The shipped one."""
+"""Name of the way that draws with the shipped network."""
 
 GAINS: Mapping[Way, Mapping[Quality, Mapping[int, float]]] = {
     NETWORK: {
@@ -30,16 +30,16 @@ GAINS: Mapping[Way, Mapping[Quality, Mapping[int, float]]] = {
         "final": {128: 0.16, 256: 0.18, 512: 0.15},
     },
 }
-"""Way -> quality -> width of square frames, pixels -> dB. Those of 512: two scenes."""
+"""Way -> quality -> width of square frames, pixels -> gain in dB. Figures of 512 are from two scenes."""
 
 
 def quality_of(supersample: int, reflections: int) -> Quality:
-    """The one of the two that a frame is like: final where it has sub-pixels, or rays for reflections."""
+    """Return the quality of a frame: final if it has sub-pixels or reflection rays, else preview."""
     return "final" if supersample > 1 or reflections > 0 else "preview"
 
 
 def expected_gain(way: Way, quality: Quality, width: int, height: int) -> float:
-    """What a way gains over lit at least, dB, between the sizes of GAINS by the logarithm of the side.
+    """Return the least gain of a way over lit, dB, interpolated in the logarithm of the frame's side.
 
     The side is that of a square of as many pixels. Beyond the sizes that were measured the nearest holds.
     """
@@ -49,6 +49,6 @@ def expected_gain(way: Way, quality: Quality, width: int, height: int) -> float:
 
 
 def best_first(ways: Iterable[Way], quality: Quality, width: int, height: int) -> dict[Way, float]:
-    """Ways of which it is known -> what they gain at least, dB; the one that gains most comes first."""
+    """Return ways with known gain -> least gain, dB; the largest gain comes first."""
     gains = {way: expected_gain(way, quality, width, height) for way in ways if way in GAINS}
     return dict(sorted(gains.items(), key=lambda each: -each[1]))

@@ -1,4 +1,4 @@
-"""The two exchangeable parts: the renderer, and the codec inside it."""
+"""Protocols of the two exchangeable parts: the renderer, and the codec inside it."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tron.neural.configs import GuidedConfig
 
 
 class Codec(Protocol):
-    """Video to latents and back, causally: the first frame stands alone.
+    """Encodes video to latents and back, causally: the first frame is encoded alone.
 
     Attributes:
         latent_channels: C of a latent.
@@ -38,7 +38,7 @@ class Codec(Protocol):
 
 
 class Renderer(nn.Module):
-    """Network from guidance to the picture.
+    """A network that draws the picture from guidance.
 
     One of your own defines `config`, whose type is the class of its settings, and `forward`; the rest has
     defaults. It is made from its settings alone: `MyNetwork(config)`.
@@ -55,12 +55,12 @@ class Renderer(nn.Module):
 
     @property
     def reach(self) -> int | None:
-        """Pixels around a pixel that it depends on to speak of; None: all of the picture."""
+        """Receptive field: pixels around a pixel on which it noticeably depends; None: the whole picture."""
         return None
 
     @property
     def stride(self) -> int:
-        """Pixels between the places at which a part of a picture is drawn as in the whole."""
+        """Tile step in pixels: a part that starts at a multiple is drawn as in the whole picture."""
         return self.space_block
 
     def forward(self, buffers: Mapping[str, Tensor], weights: Mapping[str, float] | None = None) -> Tensor:
@@ -73,23 +73,23 @@ class Renderer(nn.Module):
         raise NotImplementedError
 
     def check_weights(self, weights: Mapping[str, float] | None) -> None:
-        """TronError unless `forward` takes such weights; None is always taken."""
+        """Raise TronError unless `forward` accepts these weights; None is always accepted."""
         if weights is not None:
             raise TronError(f"a {type(self).__name__} has no latents to weigh", mend="leave weights out")
 
     def hidden_matrices(self) -> list[nn.Parameter]:
-        """Weights between hidden layers, 2-D, which Muon may optimise; here none, so that AdamW takes all."""
+        """Return 2-D weights between hidden layers that Muon may optimise; none here, so AdamW takes all."""
         return []
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """Parameters by name of the paths between frames, which start from adding nothing; here none."""
+        """Return parameters of the layers between frames, by name, which initially add zero; here none."""
         return {}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
         """Fit what is fitted before training, to videos (B, 3, K, H, W) in [-1, 1]; here nothing."""
 
     def stacked(self, buffers: Mapping[str, Tensor]) -> list[Tensor]:
-        """The buffers of `config.guidance`, in order, checked."""
+        """Return the buffers of `config.guidance`, in order, after checking them."""
         if missing := [name for name in self.config.guidance if name not in buffers]:
             raise TronError(f"the renderer needs the buffer '{missing[0]}'", mend="give all its guidance")
         videos = [buffers[name] for name in self.config.guidance]

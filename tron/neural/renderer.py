@@ -1,4 +1,4 @@
-"""The neural renderer: guidance buffers to the picture, by one pass through a backbone between latents."""
+"""The neural renderer: draws a picture from guidance in one pass through a backbone between latents."""
 
 from __future__ import annotations
 
@@ -30,11 +30,11 @@ PLAIN_TIMESTEP = 0.2  # what the tiny transformer is told; any constant will do
 TILE = 1024
 """Side of a tile of a large picture, without its margin, pixels."""
 BLUR_SIDE = 5
-"""Pixels of the square that skip_blur gathers from; skip_kernel has its own."""
+"""Side in pixels of the kernel of skip_blur; skip_kernel has its own side."""
 REACH = 96
-"""Pixels that a change of guidance reaches in the pictures of the shipped U-Nets, to a 255th of white."""
+"""Distance in pixels beyond which a change of guidance changes the shipped U-Nets' pictures below 1/255."""
 HARDLY = -7.0
-"""Logarithm of what a new kernel with holes has of each neighbour, over what it has of the pixel itself."""
+"""Initial log weight of each neighbour in a dilated kernel, relative to the pixel itself."""
 
 
 def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) -> Backbone | UNet:
@@ -46,14 +46,14 @@ def _backbone(shape: UNetConfig | BackboneConfig, given: int, predicted: int) ->
 
 
 def predicted(config: RendererConfig, channels: int) -> list[int]:
-    """Numbers a pixel that the backbone predicts: colour, kernel, shares of detail, kernel with holes."""
+    """Return how many numbers per pixel the backbone predicts: colour, kernel, detail, dilated kernel."""
     taps = config.skip_kernel**2
     detail = 0 if config.skip_detail is None else channels
     return [channels, taps, detail, taps if config.skip_holes else 0]
 
 
 class NeuralRenderer(Renderer):
-    """Codec, backbone, codec. A new one with sigma None returns the buffer that `skip` names, filtered."""
+    """Codec, backbone, codec. Untrained, without sigma, it returns the buffer of `skip`, filtered."""
 
     config: RendererConfig
 
@@ -74,7 +74,7 @@ class NeuralRenderer(Renderer):
 
     @property
     def reach(self) -> int | None:
-        """As Renderer.reach: of U-Nets on pixels, whose layers see farther than it matters."""
+        """As Renderer.reach: for U-Nets on pixels, whose receptive field is larger than this."""
         shape = self.config.backbone
         if not isinstance(shape, UNetConfig) or shape.attention or self.config.codec != "pixels":
             return None
@@ -139,7 +139,7 @@ class NeuralRenderer(Renderer):
         return self.backbone.hidden_matrices()
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """As Renderer.temporal_weights: those of the backbone."""
+        """As Renderer.temporal_weights: the backbone's."""
         return {f"backbone.{name}": p for name, p in self.backbone.temporal_weights().items()}
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
@@ -248,7 +248,7 @@ def render_frames(
     overlap: Overlap = "anchor",
     weights: Mapping[str, float] | None = None,
 ) -> Iterator[np.ndarray]:
-    """Render a clip frame after frame, in the memory of one window however long it is.
+    """Render a clip frame by frame, in the memory of one window, however long the clip is.
 
     Args:
         renderer: what renders; it stays in evaluation until the last frame was taken.
@@ -315,7 +315,7 @@ def drawn_in_tiles(
     weights: Mapping[str, float] | None = None,
     side: int = TILE,
 ) -> Tensor:
-    """:meth:`Renderer.forward` of frames (B, 3, K, H, W), tile by tile where they are larger than one.
+    """Run :meth:`Renderer.forward` on frames (B, 3, K, H, W), in tiles if frames are larger than a tile.
 
     A pixel depends on those within the network's reach. Tiles begin at multiples of its stride and are given
     the reach as margin, so that they draw what one pass over the whole draws; the shipped ones within 1/255.

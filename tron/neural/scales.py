@@ -1,4 +1,4 @@
-"""Two scales of one network: what is coarse is taken from the picture drawn at half its size.
+"""Two scales of one network: low frequencies come from the picture drawn at half its size.
 
 A network that learnt noise and blur of a few pixels meets blur that is twice as wide: at half the size it is
 what was learnt.
@@ -17,7 +17,7 @@ from tron.estimation import MOST_RAYS, OCTAVES
 
 
 def halved(buffers: Mapping[str, Tensor]) -> list[Tensor]:
-    """Guidance by name, (B, 3, K, H, W) in [-1, 1], at half its size: means of 2 x 2 display values.
+    """Halve guidance by name, (B, 3, K, H, W) in [-1, 1], by means of 2 x 2 display values.
 
     An odd side's last pixel counts twice. ``sampling`` says how the larger pixels were sampled.
     """
@@ -28,7 +28,7 @@ def halved(buffers: Mapping[str, Tensor]) -> list[Tensor]:
 
 
 def of_wider_pixels(sampling: Tensor, times: float, least: float = 0.0) -> Tensor:
-    """``sampling`` (..., 3, K, H, W) of means of ``times`` x ``times`` pixels: as many more rays, wider.
+    """Return ``sampling`` (..., 3, K, H, W) for means of ``times`` x ``times`` pixels: more rays, wider.
 
     What lies partly beyond the surfels is off by a part of that.
 
@@ -41,7 +41,7 @@ def of_wider_pixels(sampling: Tensor, times: float, least: float = 0.0) -> Tenso
 
 
 def with_coarse(fine: Tensor, coarse: Tensor) -> Tensor:
-    """A picture (B, C, K, H, W) plus, enlarged bilinearly, ``coarse`` less its means of 2 x 2."""
+    """Add to a picture (B, C, K, H, W), enlarged bilinearly, ``coarse`` minus the picture's 2 x 2 means."""
     height, width = fine.shape[-2:]
     frames = (coarse - _mean(fine)).transpose(1, 2).flatten(0, 1)
     wide = interpolate(frames, scale_factor=2, mode="bilinear", align_corners=False)[..., :height, :width]

@@ -14,21 +14,21 @@ SHIPPED = {
     "surfaces": "of pbr, irradiance, lit, albedo and surface",
     "paper": "of pbr and irradiance, the paper's buffers",
 }
-"""Name -> what the network is given."""
+"""Name -> description of the network's input."""
 DEFAULT = "surfaces"
-"""The one that ``auto`` means."""
+"""Name of the checkpoint that ``auto`` means."""
 AUTO = "auto"
-"""What tron-relight is told unless it is told otherwise: :data:`DEFAULT`, or what surely gains more."""
+"""Default of ``checkpoint``: :data:`DEFAULT`, or a way that surely gains more."""
 
 
 def installed() -> dict[str, Path]:
-    """Name -> file of the shipped checkpoints that this installation came with."""
+    """Return name -> file of the shipped checkpoints in this installation."""
     files = {name: FOLDER / f"{name}.safetensors" for name in SHIPPED}
     return {name: path for name, path in files.items() if path.is_file()}
 
 
 def shipped(name: str) -> Path:
-    """The file of a shipped checkpoint.
+    """Return the file of a shipped checkpoint.
 
     Raises:
         TronError: no checkpoint has this name, or this installation came without its file.
@@ -43,7 +43,7 @@ def shipped(name: str) -> Path:
 
 
 def checkpoint_file(checkpoint: str | Path) -> Path:
-    """The file that a setting such as `checkpoint` means: that of a shipped name, or the path itself.
+    """Return the file that a setting such as `checkpoint` means: of a shipped name, or the path itself.
 
     A name wins over a file that is called like it. Raises TronError where a name's file did not come with
     this installation.

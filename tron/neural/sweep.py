@@ -1,4 +1,4 @@
-"""The weights of pbr and irradiance, swept: how much a picture owes to each."""
+"""Sweep of the weights of pbr and irradiance: how much a picture depends on each."""
 
 from __future__ import annotations
 
@@ -12,12 +12,12 @@ from tron.neural.configs import PAPER_GUIDANCE
 from tron.neural.renderer import NeuralRenderer, to_display_array, to_tensor
 
 SWEEP = (0.0, 0.25, 0.5, 0.75, 1.0)
-"""Weights that each of the two takes."""
+"""Weights that each of the two buffers takes."""
 
 
 @torch.no_grad()
 def weight_sweep(renderer: NeuralRenderer, displayed: Mapping[str, np.ndarray]) -> np.ndarray:
-    """Pictures of one frame under each pair of weights (w_pbr, w_irradiance).
+    """Render one frame with each pair of weights (w_pbr, w_irradiance).
 
     Other buffers keep their weight (1 / n of n where the configuration says nothing). With (0, 0) and no
     other buffer the backbone is given zeros: what stands there is what the network makes of nothing, on top

@@ -1,4 +1,4 @@
-"""Weights in and out: our safetensors files, and the published Cosmos-Predict2 from local paths.
+"""Save and load weights: our safetensors files, and the published Cosmos-Predict2 from local paths.
 
 Nothing is ever fetched from the network and nothing in a file is executed.
 """
@@ -58,7 +58,7 @@ def save_renderer(path: str | Path, renderer: Renderer) -> None:
 
 
 def require_saved(renderer: Renderer) -> None:
-    """TronError unless what `save_renderer` writes of a renderer makes one of the same weights again.
+    """Raise TronError unless a file of `save_renderer` restores a renderer with the same weights.
 
     For a network of one's own, before it is trained: a mistake would otherwise show at the end.
     """
@@ -205,7 +205,7 @@ def load_cosmos(
 
 
 def load_cosmos_state(path: Path, config: BackboneConfig, channels: int) -> dict[str, Tensor]:
-    """The transformer's weights in diffusers' names, float32, checked key by key against the config."""
+    """Return the transformer's weights under diffusers' names, float32, checked against the config."""
     from diffusers.loaders.single_file_utils import convert_cosmos_transformer_checkpoint_to_diffusers
 
     from tron.neural.networks.backbone import transformer
@@ -244,7 +244,7 @@ FIRST, LAST = "backbone.embed.weight", ("backbone.out.weight", "backbone.out.bia
 
 
 def widened(state: dict[str, Tensor], narrow: RendererConfig, wide: NeuralRenderer) -> dict[str, Tensor]:
-    """The state of a U-Net of configuration ``narrow`` as one of ``wide``.
+    """Convert the state of a U-Net of configuration ``narrow`` to configuration ``wide``.
 
     The same state where nothing is added, or where they differ in more than guidance, scales, and a
     ``skip_detail`` or ``skip_holes`` that is new.

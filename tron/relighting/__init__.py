@@ -1,4 +1,4 @@
-"""Light a scene of surfels: one object that owns tracers, sides, bounces, and what to redo after a change."""
+"""Light a scene of surfels: one object owns tracers, sides and bounces, and updates them after a change."""
 
 from tron.estimation import Estimation
 from tron.relighting.baking import baked

@@ -39,11 +39,11 @@ from tron.tracing.hierarchy.first_hit import NOTHING, ray_seeds
 from tron.tracing.surface import Surface
 
 DIRECTIONS = 64
-"""Directions of the hemisphere that a surfel is shaded towards."""
+"""Number of directions of the hemisphere in which a surfel is shaded."""
 RAYS = 256
-"""Shadow rays of a surfel, which lends none: a mean of neighbours blurs what is no sharper than surfels."""
+"""Shadow rays per surfel. They are not shared: a mean over neighbours would blur shadows one surfel wide."""
 BACK_WEIGHT = 0.1
-"""Of directions from behind, beside those from the front.
+"""Weight of directions from behind; directions from the front have weight 1.
 
 On two development scenes 0, 0.1, 0.3 and 1 gave 32.19, 33.27, 33.27, 32.77 and 28.81, 29.41, 29.37, 29.18 dB
 through a rasteriser of 3DGS; without backs 36.86, 36.53, 36.07, 34.80 and 31.61, 31.47, 31.30, 30.89.
@@ -57,7 +57,7 @@ def baked(
     look: Look = "photograph",
     track: Callable[[range], Iterable[int]] = iter,
 ) -> GaussianScene:
-    """The scene of a relighter with a light's radiance as its harmonics; all else stays as it is.
+    """Return the relighter's scene with its lit radiance as harmonics; all other fields are unchanged.
 
     Args:
         light: the scene under a light that bounces.

@@ -1,4 +1,4 @@
-"""A scene of surfels with meshes beside it, as shading sees both.
+"""A tracer for surfels with meshes beside them.
 
 Every ray of light meets the meshes first, by one test, and the surfels if it passes. Rays that look for what
 they meet, of bounces and reflections, meet the surfels that stand for the meshes
@@ -27,7 +27,7 @@ if TYPE_CHECKING:
 
 
 class LimitedTracer(Occluder, Protocol):
-    """Surfels as a camera sees them: a ``SurfelTracer``, or a ``ProxiedTracer``."""
+    """Protocol of the tracers of surfels for one camera: ``SurfelTracer`` and ``ProxiedTracer``."""
 
     def sided(self, two_sided: bool) -> LimitedTracer: ...
 
@@ -44,7 +44,7 @@ def transmittances_past(
     active: Sequence[mi.Bool],
     normal: mi.Vector3f | None = None,
 ) -> list[mi.Float]:
-    """``surfels.transmittances`` of the rays that no mesh blocks; 0 of the others."""
+    """Return ``surfels.transmittances`` for rays that no mesh blocks, and 0 for the others."""
     lanes = [mi.Bool(each) for each in active]
     passing = [each & ~meshes.blocked(origin, along, each) for along, each in zip(directions, lanes)]
     dr.eval(passing)
@@ -53,7 +53,7 @@ def transmittances_past(
 
 
 class LightTracer(SurfelTracer):
-    """Surfels that light bounces among: those of a scene, and after them those that stand for meshes.
+    """Surfels for bounced light: first those of a scene, then surfels that stand for the meshes.
 
     Shadow rays meet the scene's surfels and the meshes themselves.
 
@@ -94,7 +94,7 @@ class LightTracer(SurfelTracer):
 
 
 class BesideMeshes:
-    """What a camera sees of surfels and meshes, and what light meets: a ``SurfelTracer`` to shading.
+    """Tracer of surfels and meshes for a camera; has the interface of ``SurfelTracer``.
 
     Args:
         seen: the surfels as a camera sees them.
@@ -109,11 +109,11 @@ class BesideMeshes:
         self.scene, self.records = light.scene, light.records
 
     def sided(self, two_sided: bool) -> BesideMeshes:
-        """The same for shadow rays of other sides: :meth:`SurfelTracer.sided`."""
+        """Return a copy with other blocking sides for shadow rays: :meth:`SurfelTracer.sided`."""
         return BesideMeshes(self._seen.sided(two_sided), self._light.sided(two_sided))
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
-        """What the camera sees; ``values`` of all surfels of ``light``."""
+        """Trace the camera's G-buffer; ``values`` are those of all surfels of ``light``."""
         meshes, count = self._light.meshes, len(self._light.surfels.scene)
         layer = meshes.seen(camera, self.scene.spacing)
         fronts = [some_of(value, 0, count) for value in values]
@@ -139,10 +139,10 @@ class BesideMeshes:
         active: Sequence[mi.Bool],
         normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
-        """Of the meshes and the surfels that a camera sees."""
+        """Return transmittances through the meshes and the surfels that a camera sees."""
         return transmittances_past(self._light.meshes, self._seen, origin, directions, active, normal)
 
 
 def some_of(values: mi.Float, first: int, count: int) -> mi.Float:
-    """``count`` of the numbers, from ``first`` on; one for all stays one."""
+    """Return ``count`` of the numbers from ``first`` on; a single number is returned as it is."""
     return lanes_of(values, dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first))

@@ -1,4 +1,4 @@
-"""A ground to stand on: the environment's own, on a level plane, with the shadows of what stands there.
+"""A ground plane that shows the environment, with the shadows of the subject on it.
 
 A map is infinitely far, so what is lit by it floats before it. Here the map is projected from a point above
 the plane, as high as the camera, onto the plane, the local scene of Debevec ("Rendering synthetic objects
@@ -52,7 +52,7 @@ class Ground:
         estimation: Estimation,
         seed: int,
     ) -> mi.Color3f:
-        """Linear radiance behind the surfels of a view: the ground's, in their shadow, and the environment's.
+        """Return linear radiance behind the surfels of a view: shadowed ground, and environment.
 
         Args:
             tracer: what casts shadows.
@@ -82,17 +82,17 @@ class Ground:
 
 
 GroundOf = Ground | Callable[[Camera], Ground | None] | None
-"""What a scene stands on, if anything; or what says that of each camera."""
+"""The ground of a scene, None for no ground, or a function that gives it for a camera."""
 
 
 @dataclass(frozen=True)
 class Footing:
-    """How a scene, z up, stands: found once, for all cameras.
+    """Subject and floor of a scene with z up: found once, for all cameras.
 
     Attributes:
-        floor: whether it has a floor of its own.
-        centre, radius: of its subject, world units.
-        height: of its lowest surfels, strays apart.
+        floor: whether the scene has a floor of its own.
+        centre, radius: of the subject, world units.
+        height: of the lowest surfels, without outliers.
     """
 
     floor: bool
@@ -102,20 +102,20 @@ class Footing:
 
     @classmethod
     def of(cls, scene: GaussianScene) -> Footing:
-        """That of a scene with z up."""
+        """Find subject and floor of a scene with z up."""
         subject = find_subject(scene)
         height = foot_height(scene.means[:, 2], scene.opacity_logits)
         return cls(has_floor(scene), subject.centre, subject.radius, height)
 
     def free(self, cameras: Sequence[Camera]) -> bool:
-        """Whether it is a thing without a floor of its own that all cameras see from without."""
+        """Return whether the scene has no floor and all cameras stand outside the subject."""
         return not self.floor and all(
             camera.position[2] > self.height and np.linalg.norm(camera.position - self.centre) > self.radius
             for camera in cameras
         )
 
     def ground(self, camera: Camera, height: float | None = None) -> Ground:
-        """The plane that it stands on, seen from as high as a camera is.
+        """Return the ground plane, with the environment projected from the height of a camera.
 
         Args:
             camera: the first of a clip.

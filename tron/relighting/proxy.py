@@ -57,8 +57,8 @@ THICK = 0.03
 """Share of thick pixels from which a proxy gains."""
 _THICK_VIEWS, _THICK_SIDE, _OPAQUE = 8, 256, 0.99
 VIEWS, SIDE, MOST_VOXELS, TRUNCATION, SIGMA, SURFELS = 64, 300, 256, 4.0, 1.0, 60_000
-"""Views of the film, most pixels of their sides, voxels along the longest side, as :mod:`tron.tracing.fusion`
-has them, and most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
+"""Number of rendered views, most pixels of their sides, most voxels along the longest side, truncation and
+sigma of :mod:`tron.tracing.fusion`, most surfels. Coarser voxels leak, finer ones keep the scan's noise."""
 _LEAST_SIDE, _PIXELS_PER_SPLAT = 64, 2.0
 _SOLID = 0.5
 _PITS = 3
@@ -77,7 +77,7 @@ _MADE = "of these views and voxels, closed, normals evened, materials of the spl
 
 @dataclass(frozen=True, eq=False)
 class Proxy:
-    """One layer of surfels that light sees.
+    """One layer of surfels on which light is computed.
 
     Attributes:
         surfels: oriented, with the scan's materials, in its world.
@@ -90,7 +90,7 @@ class Proxy:
     lent: tuple[np.ndarray, np.ndarray] | None = field(default=None, repr=False)
 
     def painted(self, scan: GaussianScene) -> Proxy:
-        """The proxy of a scan whose splats stand as those that this one was made from, with its materials."""
+        """Return the proxy with the materials of a scan that has the same geometry as the proxy's scan."""
         lent = lenders(self.surfels, scan) if self.lent is None else self.lent
         numbers, weights = lent
         names = (*MATERIALS, "emission")
@@ -99,7 +99,7 @@ class Proxy:
         return replace(self, surfels=replace(self.surfels, **found), lent=lent)
 
     def save(self, path: Path, made_from: str) -> None:
-        """Write a PLY that says what it was made from (:func:`fingerprint`).
+        """Write a PLY that names its source by :func:`fingerprint`.
 
         Raises:
             TronError: the file cannot be written.
@@ -110,7 +110,7 @@ class Proxy:
 
     @classmethod
     def load(cls, path: Path, made_from: str) -> Proxy | None:
-        """Read :meth:`save`'s file; None where there is none, or one that was made from something else."""
+        """Read :meth:`save`'s file; None if it is missing or was made from another source."""
         comments = header_comments(path)
         voxels = [said.split()[2] for said in comments if said.startswith("tron voxel ")]
         if not made_as_now(path, f"proxy {made_from}") or not voxels:
@@ -122,7 +122,7 @@ class Proxy:
 
 
 def fingerprint(scene: GaussianScene, cameras: Sequence[Camera] | None) -> str:
-    """Hexadecimal digest of all that a proxy is made from."""
+    """Return a hexadecimal digest of everything that a proxy depends on."""
     digest = hashlib.sha256(_MADE.encode())
     for name in FIELDS:
         if name != "emission" or scene.emission.any():  # proxies of before know of none
@@ -135,7 +135,7 @@ def fingerprint(scene: GaussianScene, cameras: Sequence[Camera] | None) -> str:
 
 
 def thickness(tracer: SurfelTracer, cameras: Sequence[Camera] | None = None) -> float:
-    """Share of the opaque pixels of some views whose lift is above one spacing; 0 where nothing is opaque.
+    """Return the share of opaque pixels whose lift exceeds one spacing; 0 if no pixel is opaque.
 
     Args:
         tracer: of the scan.
@@ -155,7 +155,7 @@ def make_proxy(
     cameras: Sequence[Camera] | None = None,
     track: Callable[[range], Iterable[int]] = iter,
 ) -> Proxy | None:
-    """Film a scan, fuse what is seen, and cover it with surfels; None where views agree on no surface.
+    """Render a scan from many views, fuse depths, cover them with surfels; None if views find no surface.
 
     Args:
         tracer: of the scan.
@@ -182,7 +182,7 @@ def make_proxy(
 
 
 def lenders(surfels: GaussianScene, scan: GaussianScene) -> tuple[np.ndarray, np.ndarray]:
-    """Which splats lend a proxy's P surfels their materials: (P, K) numbers, and weights whose sum is one.
+    """Find the splats that give P proxy surfels their materials: (P, K) numbers, and weights that sum to 1.
 
     The nearest, each by its opacity, its area, its distance across the normal and how far out it lies.
     """
@@ -200,7 +200,7 @@ def lenders(surfels: GaussianScene, scan: GaussianScene) -> tuple[np.ndarray, np
 
 
 def evened(surfels: GaussianScene) -> GaussianScene:
-    """The surfels, their normals means over neighbours that look the same way.
+    """Smooth the normals of surfels over neighbours that face the same way.
 
     Splats of something smooth and plain, such as a white pot, lie at depths that wander, and light would show
     each wave. Edges stay.
@@ -226,7 +226,7 @@ def _film(scene: GaussianScene, cameras: Sequence[Camera] | None, views: int, si
 
 
 def seen_by(tracer: SurfelTracer, camera: Camera) -> GBuffer:
-    """What a camera sees; where normals have no sign, of the sides that face it."""
+    """Trace a camera's G-buffer; surfels whose normals have no sign are turned to face the camera."""
     scene = tracer.scene
     if not scene.oriented:
         tracer = tracer.turned_over(scene.looks_away(camera.position))
@@ -234,7 +234,7 @@ def seen_by(tracer: SurfelTracer, camera: Camera) -> GBuffer:
 
 
 class ProxiedTracer:
-    """Camera rays meet a scan and its proxy, all other rays the proxy: a ``SurfelTracer`` to shading.
+    """Camera rays hit scan and proxy, other rays the proxy; has the interface of ``SurfelTracer``.
 
     Args:
         scan: as a camera sees it.
@@ -259,20 +259,20 @@ class ProxiedTracer:
         self._normals = [mi.Vector3f(*(mi.Float(aligned(axis)) for axis in each.T)) for each in normals]
 
     def showing(self, scan: SurfelTracer) -> ProxiedTracer:
-        """The same for a camera that sees other sides of the scan's surfels."""
+        """Return a copy for a camera that sees other sides of the scan's surfels."""
         other = copy(self)
         other._scan = scan
         return other
 
     def painted(self, scan: SurfelTracer, surfels: GaussianScene) -> ProxiedTracer:
-        """The same of a scan, and of a proxy, that have other materials alone."""
+        """Return a copy for a scan and a proxy that differ only in materials."""
         other = copy(self)
         other._scan, other.light = scan, self.light.moved(surfels)
         other.scene, other.records = other.light.scene, other.light.records
         return other
 
     def sided(self, two_sided: bool) -> ProxiedTracer:
-        """The same for shadow rays of other sides: :meth:`SurfelTracer.sided`."""
+        """Return a copy with other blocking sides for shadow rays: :meth:`SurfelTracer.sided`."""
         other = copy(self)
         other._scan, other.light = self._scan.sided(two_sided), self.light.sided(two_sided)
         return other
@@ -280,7 +280,7 @@ class ProxiedTracer:
     def gbuffer(
         self, camera: Camera, values: Sequence[mi.Float] = (), limit: mi.Float | None = None
     ) -> GBuffer:
-        """What the camera sees of the scan, where light falls on it; ``values`` of the proxy's surfels.
+        """Trace the camera's G-buffer of the scan, with points on the proxy; ``values`` are the proxy's.
 
         ``limit`` as of :meth:`SurfelTracer.gbuffer`.
         """
@@ -309,7 +309,7 @@ class ProxiedTracer:
         return merged
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
-        """The scan's surfels at their centres, with the normals and ``values`` of the proxy's nearest."""
+        """Return the scan's surfels at their centres, with normals and ``values`` of the proxy nearby."""
         found = centres(self._scan.records, dr.arange(mi.UInt32, len(self._scan.scene)))
         return replace(
             found, normal=mi.Normal3f(self._normals[0]), values=self._carried(values, self._sides[0])
@@ -336,7 +336,7 @@ class ProxiedTracer:
         active: Sequence[mi.Bool],
         normal: mi.Vector3f | None = None,
     ) -> list[mi.Float]:
-        """Of the proxy, and from some voxels on of the scan too."""
+        """Return transmittances through the proxy, and beyond some voxels through the scan too."""
         near = self.light.transmittances(origin, directions, active, normal)
         off = dr.opaque(mi.Float, self._near)
         found = []

@@ -1,4 +1,4 @@
-"""A scene that can be lit: the one place that makes a proxy, traces bounces, picks sides and bakes light.
+"""A scene that can be lit: makes a proxy, traces bounces, chooses sides and bakes light.
 
     relighter = Relighter(GaussianScene.load("scene.ply"), Estimation(rays=64))
     light = relighter.under(EnvironmentMap.load("studio.hdr").rotated(90))   # bakes once
@@ -62,25 +62,25 @@ log = logging.getLogger(__name__)
 
 Light = EnvironmentMap | CubemapLight | Lighting
 REACH = ("oriented", "spacing", "kernel_degree", "projection", "log_scales", "opacity_logits")
-"""What decides how far surfels reach, and their backs: where one differs, all rays may."""
+"""Fields that decide the extent and back faces of surfels: if one differs, all rays are traced again."""
 
 
 class Relighter:
-    """A scene to be lit by any number of lights. Where no Mitsuba variant is set, ``llvm_ad_rgb`` is.
+    """A scene that any number of lights can light. If no Mitsuba variant is set, it sets ``llvm_ad_rgb``.
 
     Args:
         scene: the surfels, valid (``scene.validate()``); they must not change while this object lives.
-        estimation: of the light, for all that is traced, baked and rendered.
-        seed: root of the random numbers of rays between surfels, and of bakes that are given no other.
-        backdrop: (M,) bool, surfels that are seen, from the side they show, and in no light's way.
+        estimation: how light is estimated, in all tracing, baking and rendering.
+        seed: root of the random numbers of rays between surfels, and of bakes without a seed of their own.
+        backdrop: (M,) bool, surfels that cameras see, from their front side, but that block no light.
         track: wraps the loop over rays of the surfels, to show progress.
-        proxy: whether light sees a proxy: where the scene is thick or its normals have no sign (auto), or as
-            said; or one that is there.
-        cameras: that the scene was filmed with, to film its proxy; None: from around it.
-        proxy_file: PLY that keeps the proxy; taken where it was made from the same, else written.
+        proxy: whether light is computed on a proxy: auto (if the scene is thick or its normals have no sign),
+            always, never; or an existing proxy.
+        cameras: of the scene's photos, as views for the proxy; None: cameras around the scene.
+        proxy_file: PLY that keeps the proxy; read if it was made from the same scene, else written.
         filming: wraps the loop over the proxy's views, to show progress.
-        ground: what the scene stands on and throws shadows on, where frames show the environment; or what
-            says that of each camera.
+        ground: plane on which the scene stands and casts shadows, where frames show the environment; or a
+            function that gives it for a camera.
         meshes: models, each as :func:`tron.models.load.load_model` reads it, where they stand, in the scene's
             world and units: opaque things beside the surfels (:mod:`tron.tracing.meshes`).
     """
@@ -112,7 +112,7 @@ class Relighter:
         self.meshes = Meshes(meshes, seed) if meshes else None
 
     def tracer(self, camera: Camera) -> SurfelTracer | ProxiedTracer | BesideMeshes:
-        """The tracer for a camera: one for all, unless surfels are turned to each."""
+        """Return the tracer for a camera: one for all cameras, unless surfels are turned towards each."""
         seen = self._seen_by(camera)
         tracer = seen if self._proxied is None else self._proxied.showing(seen)
         return tracer if self._beside is None else BesideMeshes(tracer, self._beside)
@@ -130,7 +130,7 @@ class Relighter:
 
     @cached_property
     def proxy(self) -> Proxy | None:
-        """What light sees in place of the scene; None: the scene. Made when it is first asked for."""
+        """The proxy on which light is computed, made at first use; None: the scene itself is used."""
         if isinstance(self._choice, Proxy):
             return self._choice
         content = self.scene if self._backdrop is None else subset(self.scene, ~self._backdrop)
@@ -217,7 +217,7 @@ class Relighter:
         return traced.sided(self.estimation.two_sided)
 
     def surfels(self, values: Sequence[mi.Float] = ()) -> Surface:
-        """(M,) the scene's surfels at their centres, facing as light sees them, with ``values`` of a bake."""
+        """Return the M surfels at their centres, with the sides used for light and ``values`` of a bake."""
         emission = self._tracer.emission
         if self._proxied is not None:
             return replace(self._proxied.surfels(values), emission=emission)
@@ -227,7 +227,7 @@ class Relighter:
         return replace(found, values=list(own), emission=emission)
 
     def gbuffer(self, camera: Camera, values: Sequence[mi.Float] = ()) -> GBuffer:
-        """What a camera sees; ``values`` of the surfels that light sees are composited too."""
+        """Trace a camera's G-buffer; ``values`` of the surfels used for light are composited too."""
         return self.tracer(camera).gbuffer(camera, values)
 
     def surface_maps(self, camera: Camera, *estimations: Estimation) -> list[dict[str, np.ndarray]]:
@@ -236,16 +236,16 @@ class Relighter:
 
     @cached_property
     def transport(self) -> BounceTransport:
-        """Ways of light between the surfels that it sees, traced when they are first asked for."""
+        """Light transport between the surfels used for light, traced at first use."""
         return BounceTransport.trace(self._light, seed=self.seed, track=self._track)
 
     def prepare(self) -> Relighter:
-        """Make what does not depend on lights now rather than under the first of them; returns itself."""
+        """Compute now everything that does not depend on the light; return the relighter itself."""
         _ = self.transport if self.estimation.bounces else self.proxy
         return self
 
     def under(self, light: Light, seed: int | None = None, *, quick: bool = False) -> Illumination:
-        """Let one environment, at one turn, bounce in the scene.
+        """Bake the direct and bounced light of one environment at one rotation.
 
         Args:
             light: an environment, or one that is prepared; this one's gradients end at the bake.
@@ -277,7 +277,7 @@ class Relighter:
         proxy: Proxy | None = None,
         meshes: Meshes | None = None,
     ) -> Illumination:
-        """A scene under a light, with no more work than it asks for beside what is there.
+        """Return a scene under a light, recomputing only what changed.
 
         ================  =============  ===============================================================
         scene             light          what is done
@@ -345,7 +345,7 @@ class Relighter:
         proxy: Proxy | None = None,
         meshes: Meshes | None = None,
     ) -> Relighter:
-        """The relighter of another scene, which shares what stays the same; this one goes on as it is.
+        """Return a relighter of a changed scene that shares everything unchanged; this one stays as it is.
 
         Where surfels have moved or have other materials, the hierarchy is refitted and only rays that have
         changed are traced again: as if all were, to the bit. Rays are drawn in the hierarchy's order, which a
@@ -423,7 +423,7 @@ class Illumination:
     turn: float | None = None
 
     def turned_to(self, rotation_deg: float) -> Illumination:
-        """The same environment at another rotation about +z: baked, not prepared again.
+        """Rotate the same environment about +z and bake again, without preparing it again.
 
         Raises:
             TronError: the light is a cubemap.
@@ -438,14 +438,14 @@ class Illumination:
         reflections: int | None = None,
         supersample: int | None = None,
     ) -> Illumination:
-        """The same bake for frames of other rays a pixel: what of an :class:`Estimation` no bake knows."""
+        """Reuse the bake for frames with other per-pixel settings of :class:`Estimation`."""
         given = {"rays": rays, "filtered": filtered, "reflections": reflections, "supersample": supersample}
         wanted: dict[str, Any] = {name: value for name, value in given.items() if value is not None}
         other = Estimation.model_validate(self.estimation.model_dump() | wanted)
         return replace(self, estimation=other)
 
     def trace(self, camera: Camera, seed: int | None = None, view: GBuffer | None = None) -> TracedFrame:
-        """Trace all rays of a frame; see :meth:`render`."""
+        """Trace all rays of a frame (arguments as of :meth:`render`)."""
         seed = self.relighter.frame_seed if seed is None else seed
         tracer, bounce = self.relighter.tracer(camera), self.bounced
         if view is None:
@@ -465,7 +465,7 @@ class Illumination:
         view: GBuffer | None = None,
         denoise: str | None = None,
     ) -> Guidance:
-        """All buffers of one frame, linear.
+        """Render all buffers of one frame, linear.
 
         Args:
             camera: the view.
@@ -482,7 +482,7 @@ class Illumination:
 
 @dataclass(frozen=True)
 class TracedFrame:
-    """A frame whose rays are traced, to be shaded before any background.
+    """A frame whose rays are traced; it can be shaded in front of any background.
 
     Attributes:
         view: what the camera sees, of sub-pixels, if so.
@@ -497,7 +497,7 @@ class TracedFrame:
     noise: np.ndarray | None = None
 
     def shade(self, background: Sequence[float] | None = None) -> Guidance:
-        """The frame; ``background`` as of :meth:`Illumination.render`."""
+        """Shade the frame; ``background`` as of :meth:`Illumination.render`."""
         frame = shade(self.view, self.arriving, self.lighting, background, self.estimation)
         if self.noise is None:
             return frame
@@ -505,12 +505,12 @@ class TracedFrame:
         return replace(frame, lit=lit, shadowed=frame.shadowed if self.estimation.bounces else lit)
 
     def images(self, names: Iterable[str]) -> dict[str, np.ndarray]:
-        """(H, W, 3) buffers of :meth:`shade` alone, of a frame without sub-pixels and not denoised."""
+        """Return (H, W, 3) buffers of :meth:`shade` alone, for a frame without sub-pixels and denoising."""
         colors = shade_surface(self.view, self.arriving, self.lighting, None, self.estimation.brdf)
         return self.view.images({name: colors[name] for name in names})
 
     def denoised(self, denoiser: str, maps: Mapping[str, np.ndarray]) -> TracedFrame:
-        """The frame whose ``lit`` is through a denoiser (:mod:`tron.denoising`).
+        """Return the frame with a denoised ``lit`` (:mod:`tron.denoising`).
 
         So is ``shadowed`` where nothing bounces; the other buffers are as they were, and so is what stands
         behind the surfels, which has no noise but for shadows on a ground.
@@ -533,7 +533,7 @@ def _same(scene: GaussianScene, other: GaussianScene, names: Iterable[str]) -> b
 
 
 def views_under(lights: Sequence[Illumination], camera: Camera) -> list[GBuffer]:
-    """What a camera sees under each light of one relighter; once for those that see alike."""
+    """Trace a camera's view once for all lights of one relighter that share it."""
     tracer = lights[0].relighter.tracer(camera)
     views: dict[int, GBuffer] = {}
     seeing = [(light.estimation.supersample, light.estimation.rays > 0) for light in lights]

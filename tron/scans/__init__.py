@@ -1,4 +1,4 @@
-"""What a file of splats becomes before it is lit: one home for it, which commands and Python share."""
+"""Opening a file of splats: everything that happens before a scan is lit, for commands and Python alike."""
 
 from tron.scans.scan import Scan
 

@@ -1,4 +1,4 @@
-"""Cameras that a scene was filmed with, by a file or by what it shows, paths between them and from files.
+"""Cameras of a scene's photos, from a file or from the splats; camera paths between them, and from files.
 
 Either the cameras or the scene may have had its large coordinates taken away: :func:`in_frame_of`.
 """
@@ -65,13 +65,13 @@ def read_cameras(path: Path, width: int, height: int, fps: float = 24.0) -> list
 
 
 def frame_size(shape: tuple[int, int], longer: int) -> tuple[int, int]:
-    """Even width and height of a frame in the ``shape`` of another, its ``longer`` side in pixels."""
+    """Return even width and height of a frame: aspect ratio of ``shape``, longer side ``longer``, pixels."""
     width, height = (max(8, 2 * round(longer * side / max(shape) / 2)) for side in shape)
     return width, height
 
 
 def in_frame_of(offset: np.ndarray, cameras: Sequence[Camera], path: Path) -> list[Camera]:
-    """Cameras of a file in the local frame of a scene; shifted in float64.
+    """Shift cameras of a file into the local frame of a scene, in float64.
 
     A file that says its own ``offset``, as cameras.json and relight.json of a scene with one do, holds
     positions about it. One that says none holds coordinates of the map or of the local frame: whichever its
@@ -95,7 +95,7 @@ def in_frame_of(offset: np.ndarray, cameras: Sequence[Camera], path: Path) -> li
 
 
 def stated(offset: np.ndarray) -> dict[str, list[float]]:
-    """Entry of a file of cameras for an offset (3,); none where nothing was taken away."""
+    """Return the JSON entry for an offset (3,); empty if the offset is zero."""
     return {"offset": [float(value) for value in offset]} if np.any(offset) else {}
 
 
@@ -126,7 +126,7 @@ def write_cameras(folder: Path, views: Sequence[View], offset: np.ndarray = ORIG
 
 
 def filmed_cameras(scene: Path, offset: np.ndarray = ORIGIN) -> list[Camera] | None:
-    """Cameras that a scene, of an offset (3,), was filmed with, if a file beside it says so; else None.
+    """Return the cameras in ``cameras.json`` beside a scene with an offset (3,); None if it is missing.
 
     Raises:
         TronError: the file holds no cameras.
@@ -138,9 +138,9 @@ def filmed_cameras(scene: Path, offset: np.ndarray = ORIGIN) -> list[Camera] | N
 def filmed_with(
     path: Path, turn: np.ndarray, offset: np.ndarray, scene: GaussianScene | None = None
 ) -> list[Camera] | None:
-    """Cameras that a scene was filmed with, in the world turned by ``turn``; None where nothing tells.
+    """Return the cameras of a scene's photos, in the world turned by ``turn``; None if they are not known.
 
-    ``scene``, in that world, tells them where no file lies beside it and it was made from one view.
+    A ``scene`` in that world that was made from one photo gives cameras even without a file beside it.
     """
     try:
         filmed = filmed_cameras(path, offset)
@@ -224,7 +224,7 @@ def filmed_orbit(
     fov_deg: float,
     distance: float = 1.0,
 ) -> list[Camera]:
-    """A path from where the photos were taken.
+    """Plan a path between the cameras of the photos.
 
     Around what the photos look at if they were taken from all sides, which loops; once from one end to the
     other, slowing down there, if they leave a gap of more than 60 degrees. Height, distance and what is

@@ -1,4 +1,4 @@
-"""Materials of a plain scan: found once, and kept beside it with the proxy that they were found on."""
+"""Materials of a plain scan: found once and kept beside it, together with the proxy used to find them."""
 
 from __future__ import annotations
 
@@ -38,19 +38,19 @@ def with_materials(
     track: Track = lambda items, _: items,
     find: bool = True,
 ) -> GaussianScene:
-    """The scan with materials, free of the light it was captured in; as it is where none can be told.
+    """Return the scan with materials, without the light of its capture; unchanged if none can be found.
 
     The Mitsuba variant must be set.
 
     Args:
         scene: of a file without materials.
-        kept: of that file: where they are kept, with the proxy for light that they were found on.
+        kept: paths, for this file, of the materials and of the proxy for light that was used to find them.
         filmed: cameras that the scan was filmed with, in its world; None: around it.
         seed: root of the random numbers.
-        backdrop: (M,) bool, surfels that are in no light's way, which stay as they are.
-        turn: (3, 3) that the file's scene was turned by; what is kept beside it stands as it does.
+        backdrop: (M,) bool, surfels that block no light; they stay as they are.
+        turn: (3, 3) rotation that was applied to the file's scene; kept files are in the file's frame.
         track: wraps long loops.
-        find: them where none are kept, in minutes; else they stay guessed.
+        find: whether to find materials, in minutes, if none are kept; else they stay guessed.
     """
     from tron.relighting.proxy import fingerprint  # Mitsuba: not for --help
 
@@ -80,7 +80,7 @@ def with_materials(
 
 
 def put_on(scene: GaussianScene, found: GaussianScene, backdrop: np.ndarray | None = None) -> GaussianScene:
-    """The scene with the materials that were found of what is no backdrop, (M,) bool."""
+    """Return the scene with found materials on all surfels that are not in ``backdrop``, (M,) bool."""
     values = {name: getattr(found, name) for name in MATERIALS}
     if backdrop is not None:
         for name, own in values.items():

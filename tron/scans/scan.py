@@ -1,4 +1,4 @@
-"""A file of splats made ready to be lit, as tron-relight, tron-bake, tron-view and tron-edit have it.
+"""An opened file of splats, ready to be lit; tron-relight, tron-bake, tron-view and tron-edit use it.
 
     scan = Scan.open("scan.ply")
     frame = scan.under("studio.hdr").render(camera)   # the first frame of tron-relight from there
@@ -41,19 +41,19 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 LIGHT = "environment.exr"
-"""The light of a capture: a map beside its scene, in the world of the file, as tron-reconstruct writes it."""
+"""File name of the light of a capture: tron-reconstruct writes it beside the scene, in the scene's frame."""
 APART = Path("outputs")
-"""Where what is made of a scan is kept if its own folder cannot be written."""
+"""Folder for files derived from a scan whose own folder is read-only."""
 GroundChoice = Literal["auto", "none"] | float
 Materials = Literal["auto", "kept", "as_is"]
 
 
 class Scan:
-    """A file of splats; made by :meth:`open`.
+    """An opened file of splats; made by :meth:`open`.
 
     Attributes:
-        file: that it was read from.
-        loaded: all of its splats, in its frame. Its up is settled; its materials may be guessed.
+        file: the file of splats.
+        loaded: all splats, in the file's frame. Up is known; materials may be guessed.
         seed: root of all random numbers.
     """
 
@@ -122,7 +122,7 @@ class Scan:
 
     @property
     def offset(self) -> np.ndarray:
-        """(3,) what was taken away from the file's coordinates: it is added to those of the frame."""
+        """(3,) offset: coordinates of the file = local coordinates + offset."""
         return self.loaded.offset
 
     @cached_property
@@ -138,29 +138,29 @@ class Scan:
 
     @property
     def content(self) -> GaussianScene:
-        """What is framed and meets light, upright; its materials may be guessed."""
+        """The surfels that cameras frame and that light meets, upright; their materials may be guessed."""
         return self._surrounded.content
 
     @property
     def shown(self) -> GaussianScene:
-        """What cameras see, upright, with the materials of the file, guessed or not."""
+        """The surfels that cameras see, upright, with the materials of the file, guessed or not."""
         return self._surrounded.shown
 
     @property
     def backdrop(self) -> np.ndarray | None:
-        """(M,) bool, surfels of :attr:`scene` that are in no light's way; None: none are."""
+        """(M,) bool, surfels of :attr:`scene` that block no light; None if all surfels do."""
         return self._surrounded.backdrop
 
     @cached_property
     def filmed(self) -> list[Camera] | None:
-        """Cameras that it was filmed with, upright; None where nothing tells."""
+        """Cameras of the scan's photos, upright; None if they are not known."""
         return filmed_with(self.file, self.turn, self.offset, self.content)
 
     def film(
         self, path: TrajectoryName, frames: int, width: int, height: int, fov_deg: float,
         distance: float = 1.0,
     ) -> list[Camera]:  # fmt: skip
-        """Cameras of a path around it, upright; orbit and still lie between those it was filmed with, if any.
+        """Cameras of a path around the scan, upright; orbit and still lie between :attr:`filmed`, if known.
 
         Args: as of :func:`tron.trajectories.plan_cameras`.
         """
@@ -177,9 +177,9 @@ class Scan:
 
     @cached_property
     def scene(self) -> GaussianScene:
-        """What cameras see, upright, with its materials: found in minutes the first time, and kept.
+        """The surfels that cameras see, upright, with materials: found once, in minutes, and kept in a file.
 
-        Where they cannot be found they stay guessed, with a line that says why.
+        If they cannot be found, they stay guessed, and a line says why.
         """
         if not self._finds_materials:
             return self.shown
@@ -189,9 +189,9 @@ class Scan:
 
     @cached_property
     def in_file(self) -> GaussianScene:
-        """All splats as the file has them, in its frame, with the materials of :attr:`scene`, to be edited.
+        """All splats in the file's frame, with the materials of :attr:`scene`, to be edited.
 
-        What surrounds the scan has none, and stays as it is.
+        Surroundings have no found materials and stay as they are.
         """
         if not self._finds_materials or self.scene.materials_guessed:
             return self.loaded
@@ -200,7 +200,7 @@ class Scan:
         return put_on(self.loaded, found, around)
 
     def over(self, environment: EnvironmentMap, file: Path) -> EnvironmentMap:
-        """A map of a file as it stands over the upright scan: that of its capture turns with it.
+        """Turn the map of the scan's own capture upright with the scan; return any other map as it is.
 
         Any other map has +z up and stays.
         """
@@ -210,7 +210,7 @@ class Scan:
         return environment.turned(self.turn)
 
     def ground(self, cameras: Sequence[Camera], choice: GroundChoice = "auto") -> Ground | None:
-        """What the scan stands on, seen from the first of a film's cameras, upright; None: nothing.
+        """Return the ground plane for the first camera of a film, upright; None: the scan has none.
 
         Args:
             cameras: of the film.
@@ -223,7 +223,7 @@ class Scan:
         return self._footing.ground(cameras[0], None if isinstance(choice, str) else choice - away)
 
     def ground_of(self, choice: GroundChoice = "auto") -> Callable[[Camera], Ground | None]:
-        """What says :meth:`ground` of each camera alone."""
+        """Return a function that gives :meth:`ground` for a single camera."""
         return lambda camera: self.ground([camera], choice)
 
     @cached_property
@@ -240,11 +240,11 @@ class Scan:
         proxy: Literal["auto", "always", "never"] = "auto",
         meshes: Sequence[Sequence[Part]] = (),
     ) -> Relighter:
-        """The scan as it is lit, with its ground and with its proxy, which is kept beside it.
+        """Return a Relighter of the scan, with its ground and its proxy; the proxy is kept beside the file.
 
         Args:
             estimation: of the light; the default is tron-relight's.
-            ground: of all frames (:meth:`ground`); auto: of each frame its own.
+            ground: for all frames (:meth:`ground`); auto: a separate one for each frame.
             proxy, meshes: as of :class:`tron.relighting.Relighter`.
         """
         from tron.relighting import Relighter
@@ -262,9 +262,9 @@ class Scan:
         return relighter
 
     def about(self, ground: GroundChoice = "auto") -> dict[str, Any]:
-        """Arguments of a Relighter of :attr:`in_file`, turned upright, and what is made of it by edits.
+        """Return arguments for a Relighter of :attr:`in_file`, turned upright, also after edits.
 
-        Its surroundings, if it has any, are in the light's way: its proxy is none that is kept.
+        Surroundings, if there are any, block light there: so the proxy is not the one kept in a file.
         """
         whole = self._surrounded.around is None
         return {
@@ -275,7 +275,7 @@ class Scan:
 
     @property
     def proxy_file(self) -> Path:
-        """The file that has its proxy for light, or is to have it."""
+        """Path of the proxy for light, which may not exist yet."""
         from tron.relighting.proxy import fingerprint
 
         content = self.scene if self.backdrop is None else subset(self.scene, ~self.backdrop)
@@ -283,20 +283,20 @@ class Scan:
 
     @property
     def root(self) -> int:
-        """Root of the random numbers of light that bounces in it."""
+        """Root of the random numbers for bounced light."""
         return integer(self.seed, "relight", "bounces")
 
     def frame_seed(self, index: int) -> int:
-        """Root of the random numbers of a film's frame."""
+        """Return the root of the random numbers for a frame of a film."""
         return integer(self.seed, "relight", index)
 
     def under(
         self, light: str | Path | EnvironmentMap, estimation: Estimation = PREVIEW, *, rotation: float = 0.0
     ) -> Illumination:
-        """The scan under a light, to be rendered from any camera, upright.
+        """Light the scan; the result renders from any camera, upright.
 
         Args:
-            light: an environment, +z up, or its file; that of the scan's capture turns with it.
+            light: an environment, +z up, or its file; the light of the scan's capture is turned upright.
             estimation: of the light.
             rotation: of the environment about up, degrees, counter-clockwise seen from above.
 
@@ -313,7 +313,7 @@ class Scan:
 
 
 def is_of_capture(light: Path, scene: Path) -> bool:
-    """Whether a map is the one beside the scene's file."""
+    """Return whether a light is the ``environment.exr`` beside the scene's file."""
     return light.resolve() == scene.with_name(LIGHT).resolve()
 
 

@@ -1,4 +1,4 @@
-"""Treatment of what surrounds a scene: a shell of sky is left out, or stands behind it, or stays a lid."""
+"""Surroundings of a scene: a shell of sky is dropped, shown as a backdrop, or kept."""
 
 from __future__ import annotations
 
@@ -24,13 +24,13 @@ _SAYS = {
 
 @dataclass(frozen=True)
 class Surrounded:
-    """A scene and what surrounds it.
+    """A scene divided into content and surroundings.
 
     Attributes:
         shown: the surfels that cameras see.
-        content: those of them that are framed and meet light.
-        backdrop: (M,) bool, those of ``shown`` that are not in ``content``; None where all are.
-        around: (N,) bool, those of the scene that are not in ``content``; None where all are.
+        content: the surfels of ``shown`` that cameras frame and that light meets.
+        backdrop: (M,) bool, surfels of ``shown`` that are not in ``content``; None if all are.
+        around: (N,) bool, surfels of the scene that are not in ``content``; None if all are.
     """
 
     shown: GaussianScene
@@ -42,7 +42,7 @@ class Surrounded:
 def treat_surroundings(
     scene: GaussianScene, treatment: Treatment, where: Path, key: str = "surroundings"
 ) -> Surrounded:
-    """Find what surrounds a scene, say so in a line that names ``key``, unless that is empty, and treat it.
+    """Find the surroundings of a scene and treat them; a line names the setting ``key``, unless it is empty.
 
     The Mitsuba variant must be set.
     """

@@ -1,4 +1,4 @@
-"""Neutral ground between the data engine, training and evaluation: what a dataset folder holds.
+"""The dataset format, shared by the data engine, training and evaluation.
 
 `schema` names the members of a clip, `writer` makes byte-identical tar shards, `manifest` accounts for
 them, `reader` opens them again without ever unpickling anything, `clip_store` reads single frames of them by

@@ -1,4 +1,4 @@
-"""Clips of a split by number, of which only the frames and members that are asked for are read."""
+"""Random access to the clips of a split: reads only the requested frames and members."""
 
 from __future__ import annotations
 
@@ -18,17 +18,17 @@ from tron.shards.reader import DAMAGED, LARGEST_META, decode_frames, decode_meta
 from tron.shards.schema import META_SUFFIX, Clip, ClipMeta
 
 MOST_METAS = 256
-"""Clips whose metadata are kept."""
+"""Number of clips whose metadata are cached."""
 MOST_INDEXED = 12_000_000
-"""Files whose places are kept, 16 bytes each; the shards that were used longest ago are forgotten."""
+"""Number of files whose offsets are cached, 16 bytes each; least recently used shards are dropped."""
 MOST_OPEN = 64
-"""Files of a disk that are kept open."""
+"""Number of local files that are kept open."""
 LARGEST_READ = 64 * 2**20
 """Bytes up to which neighbouring ranges are read at once."""
 _LOCAL_GAP = 4096
 _REMOTE_GAP = 2**20  # a request costs more than a megabyte that nobody wants
 Range = tuple[int, int]
-"""First byte and the byte behind the last."""
+"""First byte, and the byte after the last."""
 
 
 class ClipStore:
@@ -71,16 +71,16 @@ class ClipStore:
         return self._ends[-1]
 
     def key(self, number: int) -> str:
-        """Key of a clip; IndexError where there is no such number."""
+        """Return the key of a clip; IndexError if there is no such number."""
         entry, place = self._find(number)
         return entry.keys[place]
 
     def split_of(self, number: int) -> str:
-        """Split of a clip; IndexError where there is no such number."""
+        """Return the split of a clip; IndexError if there is no such number."""
         return self._find(number)[0].split
 
     def first_of_splits(self) -> list[int]:
-        """Number of the first clip of each of the splits."""
+        """Return the number of the first clip of each split."""
         starts = [0, *self._ends[:-1]]
         return [
             start
@@ -89,7 +89,7 @@ class ClipStore:
         ]
 
     def meta(self, number: int) -> ClipMeta:
-        """Metadata of a clip; TronError where they are missing, damaged or of another clip."""
+        """Read the metadata of a clip; TronError if they are missing, damaged or of another clip."""
         if number not in self._metas:
             key = self.key(number)
             files = self._files(number, [META_SUFFIX])
@@ -107,7 +107,7 @@ class ClipStore:
     def read_frames(
         self, number: int, frames: Sequence[int] | None = None, members: Iterable[str] | None = None
     ) -> Clip:
-        """Clip of chosen frames, in that order, (K, H, W, C) float32 a member; all metadata.
+        """Read chosen frames of a clip, in that order, (K, H, W, C) float32 per member, and all metadata.
 
         Args:
             number: of the clip in the split, from 0.
@@ -129,7 +129,7 @@ class ClipStore:
         return decode_frames(meta, self._files(number, names), members, frames)
 
     def close(self) -> None:
-        """Close the shards that are open; they open again when they are read."""
+        """Close all open shards; they are opened again when read."""
         self._ranges.close()
 
     def _find(self, number: int) -> tuple[ShardEntry, int]:
@@ -232,7 +232,7 @@ class ByteRanges:
         return self._folder
 
     def read(self, name: str, ranges: Iterable[Range]) -> Iterator[tuple[Range, bytes]]:
-        """Ranges with their bytes, by their place in the file; TronError where it ends before one does."""
+        """Return ranges with their bytes, in file order; TronError if the file ends within a range."""
         gap = _LOCAL_GAP if self.folder.local is not None else _REMOTE_GAP
         for start, end, group in _neighbours(sorted(ranges), gap):
             data = self._read(name, start, end - start)

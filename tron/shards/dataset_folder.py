@@ -30,21 +30,21 @@ SIGNALLED = 128
 PATIENCE = 60.0
 """Seconds that a server may be silent."""
 DAMAGE = (tarfile.TarError, OSError, EOFError, UnicodeError, ValueError)
-"""What reading a tar that is damaged raises."""
+"""Exceptions raised by reading a damaged tar."""
 
 
 def is_url(place: Place) -> bool:
-    """Whether a place is no path: named by a URL, or `pipe:COMMAND`."""
+    """Return whether a place is a URL or `pipe:COMMAND` instead of a path."""
     return "://" in str(place) or is_pipe(place)
 
 
 def is_pipe(place: Place) -> bool:
-    """Whether a place is what a shell's command prints, as webdataset writes it."""
+    """Return whether a place is `pipe:COMMAND`, the output of a shell command, as in webdataset."""
     return str(place).startswith("pipe:")
 
 
 def gives_ranges(url: str) -> bool:
-    """Whether a URL's server gives parts of a file; also where there is no such file or server."""
+    """Return whether a server supports range requests; also true if the file or server is missing."""
     if not url.startswith(("http://", "https://")):
         return not is_pipe(url)
     try:
@@ -56,7 +56,7 @@ def gives_ranges(url: str) -> bool:
 
 @contextmanager
 def open_stream(place: Place) -> Iterator[IO[bytes]]:
-    """A file to read from its start, without seeking: a path, a URL, or `pipe:COMMAND` that prints it.
+    """Open a file for sequential reading: a path, a URL, or `pipe:COMMAND`.
 
     Raises:
         TronError: it cannot be opened or read, ends too early, or the command fails.
@@ -129,7 +129,7 @@ def _path_or_url(value: object) -> object:
 
 
 DatasetPlace = Annotated[Path | str, BeforeValidator(_path_or_url)]
-"""A setting that names a dataset: a Path, or a URL, which stays as it is."""
+"""Type of a setting that names a dataset: a Path, or a URL as text."""
 
 
 class DatasetFolder:
@@ -158,11 +158,11 @@ class DatasetFolder:
         return self.place
 
     def where(self, name: str) -> str:
-        """Full path or URL of a file, for messages."""
+        """Return the full path or URL of a file, for messages."""
         return f"{self.place.rstrip('/')}/{name}"
 
     def size(self, name: str) -> int | None:
-        """Bytes of a file; None where there is none.
+        """Return the size of a file in bytes; None if it is missing.
 
         Raises:
             TronError: the store does not answer.
@@ -175,7 +175,7 @@ class DatasetFolder:
             raise self._unreadable(name, error) from error
 
     def open(self, name: str) -> IO[bytes]:
-        """A file to read from its start to its end; TronError where it cannot be opened."""
+        """Open a file for sequential reading; TronError if it cannot be opened."""
         try:
             # Some stores read 50 MB ahead unless they are told.
             ahead = {} if self._on_a_disk() else {"block_size": 4 * BLOCK_BYTES}
@@ -184,7 +184,7 @@ class DatasetFolder:
             raise self._unreadable(name, error) from error
 
     def read(self, name: str, start: int = 0, size: int | None = None) -> bytes:
-        """Bytes of a file, all of it or ``size`` from ``start``; TronError where it cannot be read."""
+        """Read a file, whole or ``size`` bytes from ``start``; TronError if it cannot be read."""
         try:
             end = None if size is None else start + size
             return self._files.cat_file(self._path(name), start=start or None, end=end)
@@ -192,7 +192,7 @@ class DatasetFolder:
             raise self._unreadable(name, error) from error
 
     def sha256(self, name: str) -> str:
-        """SHA-256 of a file, 64 hexadecimal digits, read as it comes; TronError where it cannot be read."""
+        """Return the SHA-256 of a file, 64 hexadecimal digits; TronError if it cannot be read."""
         found = hashlib.sha256()
         with self.open(name) as file:
             try:
@@ -203,7 +203,7 @@ class DatasetFolder:
         return found.hexdigest()
 
     def sizes(self, below: str = "") -> dict[str, int]:
-        """Bytes of the files in this folder, or in one within it, by name; none where it is not.
+        """Return the sizes in bytes of all files in this folder, or a sub-folder, by name; empty if missing.
 
         Raises:
             TronError: the store does not answer.
@@ -225,7 +225,7 @@ class DatasetFolder:
         }
 
     def put(self, path: Path, name: str) -> None:
-        """Send a file there under a name, whole or not at all, and see that it has arrived.
+        """Upload a file under a name, whole or not at all, and check its size there.
 
         Large files go in several parts; an object store shows an object when the last has come. Its client
         sends checksums along where the store knows them; the size is looked up afterwards.
@@ -251,7 +251,7 @@ class DatasetFolder:
             raise TronError(f"{there} bytes arrived of {wanted}", self.where(name), "start this again")
 
     def require_writable(self) -> None:
-        """Raise TronError where a small file cannot be written and removed."""
+        """Raise TronError if a small file cannot be written and removed."""
         probe = self._path(PROBE_NAME)
         try:
             if self._on_a_disk():

@@ -1,4 +1,4 @@
-"""Index of a shard: where each file of each clip lies in the tar, so that one is read without the others.
+"""Index of a shard: the offset of each file of each clip in the tar, for random access.
 
 It is found by walking the tar's headers, and kept beside the shard as `train-00000.idx` in the format of
 NVIDIA DALI's `wds2idx`, version 1.2: a line `v1.2 CLIPS`, then a line for each clip with `EXTENSION OFFSET
@@ -27,7 +27,7 @@ LARGEST_INDEX = 64 * 2**20
 _LONGEST_NUMBER = 15  # digits: a petabyte, and no overflow of int64
 
 Entry = tuple[str, int, int]
-"""Name in the tar, offset of the data, size of the data, bytes."""
+"""Name in the tar, offset and size of the data in bytes."""
 
 
 @dataclass(frozen=True)
@@ -48,7 +48,7 @@ class ClipIndex:
         return name in self.places
 
     def span(self, name: str) -> tuple[int, int]:
-        """Offset and size of a file's data, bytes."""
+        """Return offset and size of a file's data, bytes."""
         place = self.places[name]
         return int(self.offsets[place]), int(self.sizes[place])
 
@@ -63,7 +63,7 @@ def index_name(shard: str) -> str:
 
 
 def scan_index(file: IO[bytes], where: str) -> ShardIndex:
-    """Index of an open shard by its headers; the data are passed over.
+    """Build the index of an open shard from its headers; data are skipped.
 
     Args:
         file: the tar, which can seek.
@@ -87,7 +87,7 @@ def _scanned(file: IO[bytes], where: str) -> Iterator[Entry]:
 
 
 def index_of(entries: Iterable[Entry], where: str) -> ShardIndex:
-    """Index from a shard's entries in order; TronError where names repeat, are unknown or out of order."""
+    """Build an index from entries in order; TronError if names repeat, are unknown or out of order."""
     clips: dict[str, list[Entry]] = {}
     last, names = None, set()
     for entry in entries:
@@ -123,7 +123,7 @@ def index_text(entries: Iterable[Entry]) -> str:
 
 
 def parse_index(data: bytes, shard_bytes: int, where: str) -> ShardIndex | None:
-    """A kept index; None unless it is sound and accounts for every byte of a shard of that size.
+    """Parse a stored index; None unless it is valid and covers every byte of a shard of that size.
 
     Header, data and padding of each file must follow those of the one before, from the first byte of the tar
     to the zeros at its end: what `ShardWriter` and every tar writer without extended headers make.
@@ -164,7 +164,7 @@ def _tiles(entries: Sequence[Entry], shard_bytes: int) -> bool:
 
 
 def padded(size: int) -> int:
-    """Bytes that data of a size take in a tar."""
+    """Return the bytes that data of a size take in a tar, with padding."""
     return -(-size // tarfile.BLOCKSIZE) * tarfile.BLOCKSIZE
 
 

@@ -1,4 +1,4 @@
-"""The account of a dataset folder: which shards it has and what is in them."""
+"""The manifest of a dataset folder: its shards and their contents."""
 
 from __future__ import annotations
 
@@ -85,7 +85,7 @@ class Manifest(BaseModel):
 
     @classmethod
     def parse(cls, data: bytes, folder: str) -> Manifest:
-        """A manifest of its file's bytes; TronError, naming the folder, where it is damaged."""
+        """Parse the bytes of a manifest; TronError names the folder if they are damaged."""
         try:
             manifest = cls.model_validate_json(data)
         except ValidationError as error:
@@ -108,7 +108,7 @@ class Manifest(BaseModel):
         return sorted({entry.split for entry in self.shards})
 
     def of_split(self, split: str) -> list[ShardEntry]:
-        """Shards of one split in order of name; TronError, naming the splits there are, if it has none."""
+        """Return the shards of a split in order of name; if there are none, TronError names the splits."""
         entries = sorted((e for e in self.shards if e.split == split), key=lambda entry: entry.name)
         if not any(entry.samples for entry in entries):
             have = ", ".join(self.splits()) or "none"

@@ -1,4 +1,4 @@
-"""The object that moves within a clip: which pixels show it, and where it is in each frame.
+"""The moving object of a clip: its pixels and its pose in each frame.
 
 A clip's metadata hold it as text, ``extra.motion``, empty where nothing moves: with it, depth and cameras the
 flow between two frames is exact (:mod:`tron.flow`).
@@ -46,7 +46,7 @@ class Moving:
 
     @classmethod
     def of(cls, meta: ClipMeta) -> Moving | None:
-        """The object that moves in a clip; None where nothing does.
+        """Return the moving object of a clip; None if nothing moves.
 
         Raises:
             TronError: the clip is of an older program, which moved an object and did not say how, or its
@@ -85,7 +85,7 @@ class Moving:
         return _Text.model_validate({"poses": rows, "pixels": pixels}).model_dump_json()
 
     def between(self, frame: int, other: int) -> tuple[np.ndarray, np.ndarray]:
-        """The object's pixels in a frame, (H, W) bool, and how its surface moves until another.
+        """Return the object's pixels in a frame, (H, W) bool, and its motion from this frame to another.
 
         That is (4, 4), from the world at the one frame to the world at the other.
         """

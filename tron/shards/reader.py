@@ -1,4 +1,4 @@
-"""Read shards back by a table of decoders: nothing is unpickled or extracted to disk; and check datasets."""
+"""Read shards by a table of decoders, without unpickling or extracting files, and verify datasets."""
 
 from __future__ import annotations
 
@@ -56,7 +56,7 @@ class BoundedTarInfo(tarfile.TarInfo):
 
 
 def tar_files(place: Place, members: Collection[str] | None = None) -> Iterator[tuple[str, str, bytes]]:
-    """Files of one shard in order: (key, name within the clip such as "f00.pbr.exr", bytes).
+    """Iterate over the files of a shard: (key, name within the clip such as "f00.pbr.exr", bytes).
 
     place: path of the shard, its URL, or `pipe:COMMAND` that prints it; all but paths are read as they come.
     members: only these members and the metadata; the bytes of others are skipped (default: all). Refuses
@@ -81,7 +81,7 @@ def tar_files(place: Place, members: Collection[str] | None = None) -> Iterator[
 
 
 def require_plain(info: tarfile.TarInfo, count: int, where: str) -> tuple[str, str]:
-    """Key and member of a tar's entry number ``count``; TronError unless it is a file of a clip."""
+    """Return key and file name of the tar's entry ``count``; TronError unless it is a file of a clip."""
     if not info.isreg() or info.issparse():
         raise TronError(f"member {info.name[:80]!r} is not a plain file", where)
     if info.size > LARGEST_MEMBER or count >= MOST_FILES:
@@ -91,7 +91,7 @@ def require_plain(info: tarfile.TarInfo, count: int, where: str) -> tuple[str, s
 
 
 def decode_member(name: str, data: bytes) -> np.ndarray:
-    """Decode one member's file, "f00.pbr.exr", to (H, W, C) float32, by the schema's table alone."""
+    """Decode a member's file, "f00.pbr.exr", to (H, W, C) float32, by the schema's table."""
     _, _, member = parse_name(f"x.{name}")
     if member == "meta":
         raise TronError(f"{name} is metadata, not an image")
@@ -136,7 +136,7 @@ def decode_clip(
 
 
 def present_members(files: Collection[str]) -> tuple[str, ...]:
-    """Members that a clip of these files holds: all, or all but those for reference."""
+    """Return the members in these files of a clip: all members, or all but the reference members."""
     every = clip_members(reference=False)
     return clip_members(reference=any(file_name(0, m) in files for m in MEMBERS if m not in every))
 
@@ -144,7 +144,7 @@ def present_members(files: Collection[str]) -> tuple[str, ...]:
 def decode_frames(
     meta: ClipMeta, files: Mapping[str, bytes], members: Iterable[str], indices: Sequence[int]
 ) -> Clip:
-    """Decode frames of a clip whose metadata are known; TronError as decode_clip."""
+    """Decode frames of a clip whose metadata are known; raises TronError as decode_clip does."""
     decoded: dict[str, np.ndarray] = {}
     for member in members:
         images = []
@@ -165,14 +165,14 @@ def decode_frames(
 
 
 def file_name(frame: int, member: str) -> str:
-    """Name within a clip of a member's file, "f00.pbr.exr"; TronError where no member is called so."""
+    """Return a member's file name within a clip, "f00.pbr.exr"; TronError if there is no such member."""
     if member not in MEMBERS:
         raise TronError(f"no member is called {member!r}", mend=f"they are {', '.join(MEMBERS)}")
     return f"f{frame:02d}.{member}.{MEMBERS[member].extension}"
 
 
 def read_clips(folder: Place, split: str, members: Iterable[str] | None = None) -> Iterator[Clip]:
-    """All clips of a split in the manifest's order, (K, H, W, C) float32 a member; folder: path or URL.
+    """Iterate over the clips of a split in the manifest's order, (K, H, W, C) float32 per member.
 
     Raises TronError where the folder is no dataset, lacks the split, or a shard does not hold the clips
     that its manifest names.
@@ -209,7 +209,7 @@ def group_clips(files: Iterable[tuple[str, str, bytes]]) -> Iterator[tuple[str, 
 
 
 def verify(folder: Place) -> list[str]:
-    """Problems of a dataset folder (path or URL), one line each, with shard and clip; empty when it is whole.
+    """Return problems of a dataset folder (path or URL), one line each, with shard and clip; empty if none.
 
     Finds missing, stray and truncated shards (a tar cut at a member's end reads without an error: only the
     count shows it), flipped bytes, missing, repeated and unknown members, and files that do not decode.

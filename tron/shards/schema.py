@@ -22,7 +22,7 @@ from tron.errors import TronError
 SCHEMA_VERSION = 5
 
 ColorSpace = Literal["linear", "display", "reflectance"]
-"""linear light; display values in [0, 1]; linear base color in [0, 1], which is under no light."""
+"""linear: light; display: values in [0, 1]; reflectance: linear base color in [0, 1]."""
 
 GUIDANCE = ("pbr", "irradiance", "lit")
 """Members that the neural renderer is conditioned on, unless its configuration names others.
@@ -112,24 +112,24 @@ def clip_members(reference: bool) -> tuple[str, ...]:
 
 
 def light_members() -> tuple[str, ...]:
-    """Names of the guidance that is light."""
+    """Return the names of guidance members that hold light."""
     return tuple(name for name in guidance_members() if MEMBERS[name].color_space == "linear")
 
 
 def surface_members() -> tuple[str, ...]:
-    """Names of the guidance that is under no light (:func:`tron.shading.guidance.surface_maps`)."""
+    """Return names of the guidance that no light changes (:func:`tron.shading.guidance.surface_maps`)."""
     return tuple(name for name in guidance_members() if MEMBERS[name].color_space != "linear")
 
 
 def guidance_members() -> tuple[str, ...]:
-    """Names of the guidance, which networks may be given: light, and what surfaces are under any light."""
+    """Return the names of all members that networks may be given: light, and material of the surfaces."""
     return tuple(
         name for name in clip_members(reference=False) if MEMBERS[name].channels == 3 and name != TARGET
     )
 
 
 def color_spaces(reference: bool) -> dict[str, ColorSpace]:
-    """Colour space of each member of a clip that holds colours, as ``ClipMeta.color_space`` names them."""
+    """Return the colour space of each colour member of a clip, as in ``ClipMeta.color_space``."""
     return {
         name: space for name in clip_members(reference) if (space := MEMBERS[name].color_space) is not None
     }
@@ -137,7 +137,7 @@ def color_spaces(reference: bool) -> dict[str, ColorSpace]:
 
 META_SUFFIX = "meta.json"
 META_SCHEMA_NAME = "meta.schema.json"
-"""File of a dataset that says what a meta.json holds, as a JSON Schema."""
+"""File of a dataset with the JSON Schema of its meta.json files."""
 
 KEY_PATTERN = re.compile(r"[A-Za-z0-9_-]{1,60}")
 SPLIT_PATTERN = re.compile(r"[a-z][a-z0-9_]{0,30}")
@@ -147,7 +147,7 @@ _META_PATTERN = re.compile(r"([A-Za-z0-9_-]{1,60})\.meta\.json")
 
 
 def members_table() -> str:
-    """MEMBERS in Markdown, which stands in docs/guides/datasets.md."""
+    """Return MEMBERS as the Markdown table of docs/guides/datasets.md."""
     rows = ["| member | file | values | colours | clips | meaning |", "|---|---|---|---|---|---|"]
     kinds = {1: "8 bits", 2: "half float", 4: "float"}
     for name, member in MEMBERS.items():
@@ -195,13 +195,13 @@ class ClipMeta(BaseModel):
 
 
 def meta_schema() -> dict[str, Any]:
-    """The JSON Schema of a meta.json, which lies in every dataset; `ClipMeta` checks the same."""
+    """Return the JSON Schema of meta.json, which is stored in every dataset and agrees with `ClipMeta`."""
     return {"$schema": "https://json-schema.org/draft/2020-12/schema", **ClipMeta.model_json_schema()}
 
 
 @dataclass
 class Clip:
-    """Clip in memory.
+    """A clip in memory.
 
     Attributes:
         meta: its metadata.
@@ -217,26 +217,26 @@ class Clip:
         return set(clip_members(reference=True)) <= self.frames.keys()
 
     def is_display(self, member: str) -> bool:
-        """Whether a member is display-encoded already, as photographs are."""
+        """Return whether a member is already display-encoded, as photographs are."""
         return self.meta.color_space.get(member, MEMBERS[member].color_space) == "display"
 
     def space(self, member: str) -> ColorSpace | None:
-        """Colour space of a member: what the metadata say, else what the schema says."""
+        """Return the colour space of a member: from the metadata, else from the schema."""
         own = self.meta.color_space.get(member)
         return MEMBERS[member].color_space if own is None else own
 
     def exposed(self, member: str) -> np.ndarray:
-        """(K, H, W, C), light under the clip's exposure, ready for :func:`encoded`; the rest as it is."""
+        """Return a member (K, H, W, C), times the exposure if it is light, ready for :func:`encoded`."""
         image = self.frames[member]
         return image * np.float32(self.meta.exposure) if self.space(member) == "linear" else image
 
     def displayed(self, member: str) -> np.ndarray:
-        """(K, H, W, 3) in [0, 1] as a screen and a network see it: exposure, then :func:`encoded`."""
+        """Return a member as display values (K, H, W, 3) in [0, 1]: exposure, then :func:`encoded`."""
         return encoded(self.exposed(member), self.space(member))
 
 
 def encoded(image: Any, space: ColorSpace | None, axis: int = -1) -> Any:
-    """Exposed values -> what a screen and a network see, in [0, 1], arrays and tensors alike.
+    """Convert exposed values to display values in [0, 1], for arrays and tensors.
 
     Light by AgX, reflectance by the sRGB curve, the rest as it is.
     """
@@ -246,13 +246,13 @@ def encoded(image: Any, space: ColorSpace | None, axis: int = -1) -> Any:
 
 
 def displayed(member: str, image: np.ndarray, exposure: float) -> np.ndarray:
-    """A member of guidance as a screen and a network see it, (..., 3) in [0, 1]."""
+    """Return a member of guidance as display values, (..., 3) in [0, 1]."""
     space = MEMBERS[member].color_space
     return encoded(exposure * image if space == "linear" else image, space)
 
 
 def require_schema(version: int, where: str | Path) -> None:
-    """TronError unless this program reads datasets of that schema version."""
+    """Raise TronError unless this program reads datasets of this schema version."""
     if version != SCHEMA_VERSION:
         raise TronError(
             f"dataset of schema {version}, this program reads schema {SCHEMA_VERSION}",

@@ -1,4 +1,4 @@
-"""Shards that come from their beginning to their end: a pipe, a server that gives no parts of files.
+"""Sequentially read shards: from a pipe, or from a server without range requests.
 
 Such a place is a folder's URL, or shards by name: `http://host/data/train-{00000..00003}.tar`,
 `pipe:ssh host cat data/train-{00000..00003}.tar`, a path alike. Braces are expanded by webdataset, and each
@@ -25,30 +25,30 @@ from tron.shards.schema import SHARD_PATTERN, parse_name
 log = logging.getLogger(__name__)
 
 HELD = 16
-"""Clips of a shard that are held at a time, as files: what an order that does not wait can be shuffled in."""
+"""Number of clips of a shard that are held in memory at a time, as files: the shuffle buffer."""
 _SHARD = re.compile(rf"(?<![a-z0-9_])(?:{SHARD_PATTERN.pattern})")
 _UNKNOWN = "0" * 64
 
 
 def names_shards(place: Place) -> bool:
-    """Whether a place is shards by name, not a folder."""
+    """Return whether a place names shards instead of a folder."""
     return is_pipe(place) or str(place).endswith(".tar")
 
 
 def is_stream(place: Place) -> bool:
-    """Whether a place is read from its beginning to its end alone."""
+    """Return whether a place can only be read sequentially."""
     return names_shards(place) or not gives_ranges(f"{str(place).rstrip('/')}/{MANIFEST_NAME}")
 
 
 def shard_urls(place: Place) -> list[str]:
-    """Shards of a place by name, its braces expanded, in order."""
+    """Return the shards that a place names, in order, with braces expanded."""
     from webdataset.shardlists import expand_urls  # loads torch
 
     return list(expand_urls(str(place)))
 
 
 def webdataset(url: Place, buffers: Iterable[str] | None = None, split: str = "train") -> Any:
-    """Clips as a webdataset pipeline of decoded tensors, to shuffle, map and batch.
+    """Return clips as a webdataset pipeline of decoded tensors, to shuffle, map and batch.
 
     Shards are shared among the processes of torch.distributed and the workers of a DataLoader.
 
@@ -86,7 +86,7 @@ def _decoded(shards: Iterable[dict[str, str]], buffers: tuple[str, ...] | None) 
 
 
 def load_manifest(place: Place) -> Manifest:
-    """Manifest of a dataset; that of shards by name is found by reading them once, without hashes.
+    """Load the manifest of a dataset; for shards by name, read them once and make one without hashes.
 
     Raises:
         TronError: there is none, or the shards are not named as tron-datagen names them.
@@ -105,7 +105,7 @@ def load_manifest(place: Place) -> Manifest:
 
 
 def manifest_bytes(place: Place) -> bytes:
-    """A folder's manifest.json; the names of shards by name, which have no manifest."""
+    """Return a folder's manifest.json as bytes; for shards by name, their names."""
     if names_shards(place):
         return str(place).encode()
     if not is_stream(place):
@@ -127,12 +127,12 @@ def _named_shards(place: Place) -> dict[str, str]:
 
 
 def open_clips(place: Place, splits: str | Sequence[str], manifest: Manifest) -> ClipStore:
-    """Clips of splits: at random where a place gives parts of its files, else one after another."""
+    """Open clips of splits: with random access if the place supports it, else sequentially."""
     return (StreamedClips if is_stream(place) else ClipStore)(place, splits, manifest=manifest)
 
 
 class StreamedClips(ClipStore):
-    """Clips of a split of a place that cannot seek: cheap in order, block after block of HELD clips.
+    """Clips of a split that can only be read sequentially: cheap in order, in blocks of HELD clips.
 
     A clip of a block in hand costs nothing; one that lies ahead in the shard costs the bytes up to it, any
     other those from its shard's beginning. Members that nobody has asked for are not held. What is read is
@@ -153,7 +153,7 @@ class StreamedClips(ClipStore):
         self._forget()
 
     def blocks(self) -> list[list[range]]:
-        """Numbers of the clips of each block, of each shard, in order."""
+        """Return the clip numbers of each block of each shard, in order."""
         starts = [0, *self._ends[:-1]]
         return [
             [range(first, min(first + HELD, end)) for first in range(start, end, HELD)]
@@ -161,7 +161,7 @@ class StreamedClips(ClipStore):
         ]
 
     def close(self) -> None:
-        """Let go of the shard that is open."""
+        """Close the open shard."""
         self._forget()
 
     def __getstate__(self) -> dict[str, Any]:

@@ -1,4 +1,4 @@
-"""Write clips into tar shards by webdataset's TarWriter; their bytes depend on the clips alone."""
+"""Write clips into tar shards by webdataset's TarWriter; the bytes depend only on the clips."""
 
 from __future__ import annotations
 

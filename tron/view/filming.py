@@ -42,6 +42,8 @@ class Filming:
     ) -> None:
         self._scene, self._size, self._look, self._color = server.scene, DOT * size, look, color
         self._kept: list[Camera] = []
+        # Hidden as a whole while it is played: its parts are drawn anew when the path changes meanwhile.
+        self._way = server.scene.add_frame("/path", show_axes=False)
         self._shown: list[Any] = []  # in the scene: a dot each, and the way between them
         self._playing = threading.Event()
         gui = server.gui
@@ -79,8 +81,7 @@ class Filming:
             threading.Thread(target=self._play, args=(client, path), daemon=True).start()
 
     def _play(self, client: viser.ClientHandle, path: list[Camera]) -> None:
-        for shown in self._shown:
-            shown.visible = False
+        self._way.visible = False
         began, last = time.perf_counter(), False
         while self._playing.is_set() and not last:
             index = int((time.perf_counter() - began) * FRAMES_PER_SECOND)
@@ -93,8 +94,7 @@ class Filming:
             client.flush()
             time.sleep(1 / PLAYED_PER_SECOND)
         self._playing.clear()
-        for shown in self._shown:
-            shown.visible = True
+        self._way.visible = True
 
     def _step(self, event: Any) -> None:
         if event.target.value == "Play":

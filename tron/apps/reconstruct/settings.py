@@ -40,7 +40,7 @@ class Settings(ReconstructionSettings, CaptureSettings, Paths):
     """Everything that tron-reconstruct can be told."""
 
     splats: SplatSettings = Field(
-        default=SplatSettings(), description="virtual cameras that film a PLY of splats"
+        default=SplatSettings(), description="virtual cameras that render a PLY of splats"
     )
     prior: Any = Field(description="source of normals, materials and irradiance, by _target_ (prior=NAME)")
     light: FitSettings | None = Field(
@@ -50,15 +50,17 @@ class Settings(ReconstructionSettings, CaptureSettings, Paths):
         default=ReportSettings(), description="report.html; null writes none"
     )
     score_every: int = Field(
-        0, ge=0, description="steps between two scores of the held-out views, kept in curve.json; 0: none"
+        0,
+        ge=0,
+        description="steps between two evaluations of the held-out views, kept in curve.json; 0: none",
     )
     lpips_weights: Path | None = Field(
         None, description="local vgg16-397923af.pth, to score LPIPS as well; nothing is downloaded"
     )
-    overwrite: bool = Field(False, description="begin anew in an output_dir made with other settings")
+    overwrite: bool = Field(False, description="start again in an output_dir made with other settings")
     variant: Variant = "llvm_ad_rgb"
     threads: int | None = Field(
-        None, ge=1, description="threads of the renderer; null: all; 1 makes runs repeat bit by bit"
+        None, ge=1, description="threads of the renderer; null: all; with 1, runs are reproducible bit by bit"
     )
 
     def of_loading(self) -> LoadSettings:

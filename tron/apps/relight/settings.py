@@ -41,56 +41,58 @@ if TYPE_CHECKING:
 else:
     BufferName = Literal[BUFFERS]
 LONGER_SIDE = 512
-"""Pixels of the longer side of a frame, unless the settings say it."""
+"""Default of the longer side of a frame, pixels."""
 
 ProxyChoice = Literal["auto", "always", "never"]
 Side = Annotated[int, Field(ge=8, le=8192)]
 T = TypeVar("T")
 DisplayOnly = Annotated[T, Field(json_schema_extra={"display_only": True})]
-"""A setting that no traced frame is made with: frames of a folder stay where it changes."""
+"""Type of a setting that affects no traced frame: after a change the frames of a folder are kept."""
 
 
 class Settings(BaseModel):
-    """Everything that tron-relight can be told."""
+    """All settings of tron-relight."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
     scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or packed splats")
     environment: Path | Annotated[tuple[Path, ...], Field(min_length=1)] = Field(
-        description="environment map, .hdr or .exr (.png and .jpg are clipped), or what else "
-        "tron-environment reads; capture: the light that the scene's photos were taken in, environment.exr "
-        "beside it; of several, [a.hdr,b.hdr], each has its own folder in output_dir, named after the file",
+        description="environment map, .hdr or .exr (.png and .jpg are clipped), or another file that "
+        "tron-environment reads; capture: the light of the scene's photos, environment.exr "
+        "beside the scene; each map of a list [a.hdr,b.hdr] has a folder in output_dir, named "
+        "after the file",
         examples=["[a.hdr,b.hdr]"],
     )
     output_dir: DisplayOnly[Path] = Field(description="folder for frames, videos and relight.json")
     background: DisplayOnly[Background] = Field(
         "environment",
-        description="what stands behind the surfels in the relit picture: the environment, nothing (PNG with "
-        "alpha; black in videos), or a colour as on screen, such as [1,1,1] for white",
+        description="background of the surfels in the relit picture: the environment, nothing (PNG with "
+        "alpha; black in videos), or a colour in display values, such as [1,1,1] for white",
         examples=["[1,1,1]"],
     )
     ground: GroundChoice = Field("auto", description=GROUND)
     surroundings: Treatment = Field("drop", description=SURROUNDINGS)
     proxy: ProxyChoice = Field(
         "auto",
-        description="what light sees of a scan whose splats lie in many layers: one layer of surfels, made "
-        "once and kept beside it as NAME.proxy.ply, or in output_dir where that folder cannot be written; "
-        "auto: where the scan is thick by the log's number, or its normals have no sign; never: the scan "
-        "itself",
+        description="whether light is computed on a proxy of the scan: one layer of surfels, made once "
+        "and kept beside the scan as NAME.proxy.ply, or in output_dir if that folder is "
+        "read-only; auto: if the scan is thick (the log gives a number) or its normals have "
+        "no sign; never: the scan itself is used",
     )
     projection: SeenAs = "auto"
     materials: FoundMaterials = "auto"
     rotation: float | tuple[float, float] = Field(
         0.0,
-        description="turn of the environment about up, degrees, counter-clockwise seen from above; [0,360] "
-        "turns it evenly over the clip, whose end is left out so that it loops: frame i of n is at 360 i/n",
+        description="rotation of the environment about up, degrees, counter-clockwise seen from above; "
+        "[0,360] turns it evenly over the clip without the end, so that the clip loops: frame "
+        "i of n is at 360 i/n",
         examples=["[0,360]"],
     )
     trajectory: TrajectoryName | Literal["keyframes"] = Field(
         "orbit",
-        description="camera path around the scene; still: no motion; keyframes: through those of "
-        "`cameras`. Where cameras.json lies beside the "
-        "scene, orbit and still keep between its cameras",
+        description="camera path around the scene; still: no motion; keyframes: a path through the "
+        "cameras of `cameras`. If cameras.json lies beside the scene, orbit and still stay "
+        "between its cameras",
     )
     cameras: Path | None = Field(
         None,
@@ -100,37 +102,38 @@ class Settings(BaseModel):
     )
     motion: Path | None = Field(
         None,
-        description="YAML of what moves: keyframes of things and of the light, and objects that fall; see "
+        description="YAML of motions: keyframes of objects and of the light, and falling objects; see "
         "docs/guides/editing.md",
     )
     meshes: tuple[PlacedModel, ...] = Field(
         (),
-        description="models that stand in the scene as they are: they and the surfels shadow and light each "
-        "other (pip install 'tron-relight[models]'); tron-edit's insert makes surfels of a model instead",
+        description="models that stand in the scene as meshes: they and the surfels shadow and light each "
+        "other (pip install 'tron-relight[models]'); tron-edit's insert makes surfels of a "
+        "model instead",
         examples=["[{file: cow.glb, at: [0,0,1], height: 0.5}]"],
     )
     quality: Literal["preview", "final"] = Field(
         "preview",
-        description="preview: shadows of 32 rays from each surfel, once a light, and none from pixels; "
-        "final: 64 a pixel, over 2 x 2 sub-pixels, filtered, and 4 rays that look for reflections of the "
-        "scene in itself",
+        description="preview: shadows of 32 rays per surfel, once per light, and no shadow rays per "
+        "pixel; final: 64 shadow rays per pixel over 2 x 2 sub-pixels, filtered, and 4 "
+        "reflection rays",
     )
     bounces: int = Field(
         FINAL.bounces,
         ge=0,
         le=16,
-        description="times that light bounces between the surfels; 0: direct light alone, and the relit "
+        description="number of bounces of light between surfels; 0: direct light alone, and the relit "
         "picture is 'shadowed'",
     )
     reflections: int | None = Field(
-        None, ge=0, description="GGX rays per pixel that meet the scene, for glossy things; null: by quality"
+        None, ge=0, description="GGX reflection rays per pixel, for glossy surfaces; null: by quality"
     )
     supersample: Literal[1, 2] | None = Field(
         None, description="2: the mean of 2 x 2 sub-pixels, with a quarter of the rays each; null: by quality"
     )
     brdf: Brdf = Field(
         FINAL.brdf,
-        description="material: conserving, which loses no light, or lambert, as in the paper",
+        description="material: conserving (energy-conserving), or lambert, as in the paper",
     )
     estimator: Estimator = Field(
         FINAL.estimator,
@@ -151,23 +154,27 @@ class Settings(BaseModel):
         60,
         ge=1,
         le=10_000,
-        description="number of frames (those of `cameras` win, but for trajectory=keyframes)",
+        description="number of frames; the number of `cameras` takes precedence, except with "
+        "trajectory=keyframes",
     )
     width: Side | None = Field(
         None,
-        description="pixels; null: in the shape of the cameras of `cameras`, or of cameras.json beside the "
-        "scene, 512 the longer side; without any, square",
+        description="pixels; null: aspect ratio of the cameras of `cameras`, or of cameras.json beside "
+        "the scene, with 512 on the longer side; without cameras, square",
     )
-    height: Side | None = Field(None, description="pixels; null: likewise")
+    height: Side | None = Field(None, description="pixels; null: as for width")
     fov: float | None = Field(
-        None, gt=1, lt=150, description="horizontal field of view, degrees; null: as those cameras', or 40"
+        None,
+        gt=1,
+        lt=150,
+        description="horizontal field of view, degrees; null: of the cameras that set the width, or 40",
     )
     distance: float = Field(1.0, gt=0, le=100, description="factor on the automatic distance to the subject")
     fps: float = Field(24.0, gt=0, le=240, description="frames a second of the videos")
     exposure: DisplayOnly[Literal["auto"] | Annotated[float, Field(gt=0)]] = Field(
         "auto",
         description="factor before the tone curve of the relit picture; auto: metered for the light that "
-        "falls on the subject in the first frame, one for the clip, which the log says",
+        "falls on the subject in the first frame, one for the clip; the log gives it",
     )
     look: DisplayOnly[Look] = Field(
         "photograph",
@@ -185,25 +192,26 @@ class Settings(BaseModel):
     window: DisplayOnly[int | None] = Field(
         None,
         ge=1,
-        description="frames that the neural renderer sees at once, sliding by one; null: as the checkpoint "
-        "says, which is 1 for those of the package",
+        description="frames in the sliding window of the neural renderer; null: as the checkpoint says, "
+        "which is 1 for bundled checkpoints",
     )
     overlap: DisplayOnly[Overlap] = Field(
         "anchor",
-        description="which window draws a frame that lies in several: the one in whose middle it stands "
-        "(anchor), the one that ends with it (newest), or the mean of all",
+        description="which window draws a frame that lies in several: the window with the frame in its "
+        "middle (anchor), the window that ends with it (newest), or the mean of all",
     )
     reproject: DisplayOnly[int] = Field(
         5,
         ge=1,
         le=33,
-        description="neural frames that each one is the mean of: those around it (before it with "
-        "overlap=newest), brought to it along the exact motion of surfaces, against flicker, unless the "
-        "light turns; 1: itself",
+        description="number of neural frames that are averaged, against flicker: neighbours (with "
+        "overlap=newest, earlier frames) are warped along the exact motion of surfaces; not "
+        "while the light turns; 1: no average",
     )
     weights: DisplayOnly[dict[str, float] | None] = Field(
         None,
-        description="weights of the neural renderer's buffers, one for each; null: the checkpoint's own",
+        description="weights of the neural renderer's buffers, one per buffer; null: the checkpoint's "
+        "weights",
         examples=["{pbr: 0.3, irradiance: 0.7}"],
     )
     vae: DisplayOnly[Path | None] = Field(None, description="WAN 2.1 VAE, for checkpoints trained with it")

@@ -1,1 +1,1 @@
-"""Codecs between pictures and latents, one a file."""
+"""Codecs between pictures and latents, one file each."""

@@ -1,4 +1,4 @@
-"""Files of weights, ours and published ones, into state dicts; nothing in a file is executed.
+"""Read weights files, our own and published ones, into state dicts; nothing in a file is executed.
 
 safetensors holds numbers and text, and `.pt`/`.pth` files are read with `weights_only=True`.
 """
@@ -18,11 +18,11 @@ from torch import Tensor, nn
 from tron.errors import TronError
 
 PLAIN_FILE = "diffusion_pytorch_model.safetensors"
-"""What diffusers calls the weights of a folder; those of another precision have its name in theirs."""
+"""File name of diffusers weights in a folder; other precisions add their name to it."""
 
 
 def existing(path: str | Path | None, what: str, file: str) -> Path:
-    """The path, if it is there; TronError names the file to download."""
+    """Return the path if it exists; otherwise TronError names the file to download."""
     mend = f"download {file} and give its path"
     if path is None:
         raise TronError(f"no path to {what}", mend=mend)
@@ -32,7 +32,7 @@ def existing(path: str | Path | None, what: str, file: str) -> Path:
 
 
 def torch_state(path: Path) -> dict[str, Tensor]:
-    """The tensors of a `.pt` or `.pth` file, by name."""
+    """Return the tensors of a `.pt` or `.pth` file, by name."""
     try:
         # Transformer Engine's layers leave byte buffers (`_extra_state`) in published files: data, no code.
         with torch.serialization.safe_globals([io.BytesIO]):
@@ -45,7 +45,7 @@ def torch_state(path: Path) -> dict[str, Tensor]:
 
 
 def folder_state(folder: Path) -> dict[str, Tensor]:
-    """The tensors of a diffusers folder, by name: of the files that its index lists, else of the only one."""
+    """Return the tensors of a diffusers folder by name, from the files in its index or from its only file."""
     state: dict[str, Tensor] = {}
     for path in _folder_files(folder):
         state.update(safetensors_state(path)[0])
@@ -91,7 +91,7 @@ def safetensors_state(path: Path, mend: str | None = None) -> tuple[dict[str, Te
 
 
 def load_strictly(module: nn.Module, state: Mapping[str, Tensor], path: Path) -> None:
-    """Put weights into a module; TronError names the first that is missing, unknown or of another shape."""
+    """Load weights into a module; TronError names the first missing, unknown or mismatched tensor."""
     expected = module.state_dict()
     wrong = dict.fromkeys(expected.keys() - state.keys(), "missing")
     wrong |= dict.fromkeys(state.keys() - expected.keys(), "unknown")

@@ -1,4 +1,4 @@
-"""Codecs between pictures and latents, by the name that a renderer's configuration gives."""
+"""Codecs between pictures and latents, by their names in a renderer's configuration."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ CODECS: dict[str, Callable[[str | Path | None], Codec]] = {
     "wan": _wan,
     "pixels": lambda _weights: Pixels(),
 }
-"""Name -> the codec, given the path of its weights where it has any."""
+"""Name -> function that makes the codec from the path of its weights, if it has any."""
 
 
 class Pixels:

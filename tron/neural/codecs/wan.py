@@ -1,4 +1,4 @@
-"""The codec of the published weights: the WAN 2.1 VAE, frozen, read from a local file."""
+"""The codec for the published weights: the frozen WAN 2.1 VAE, read from a local file."""
 
 from __future__ import annotations
 
@@ -83,7 +83,7 @@ class WanCodec:
         return torch.cat(chunks, 2)
 
     def calibrate(self, videos: Iterable[Tensor]) -> None:
-        """Nothing: the VAE brings its own normalisation."""
+        """Fit nothing: the VAE has its own normalisation."""
 
     def _chunks(self, frames: int) -> list[tuple[int, int]]:
         """Frames [start, stop) behind each latent frame: the first alone, then four and four."""

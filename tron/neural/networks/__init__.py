@@ -1,1 +1,1 @@
-"""Networks that a renderer is made of."""
+"""Networks that are parts of a renderer."""

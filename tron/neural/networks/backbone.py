@@ -27,7 +27,7 @@ class _NoModulation(nn.Module):
 
 
 def transformer(config: BackboneConfig, in_channels: int, out_channels: int) -> CosmosTransformer3DModel:
-    """Build the transformer with diffusers' own initialisation; channels are those of the latents."""
+    """Build the transformer with diffusers' own initialisation; channels are numbers of latent channels."""
     return CosmosTransformer3DModel(
         in_channels=in_channels + int(config.padding_channel),
         out_channels=out_channels,
@@ -82,7 +82,7 @@ class Backbone(nn.Module):
         return [p for name, p in blocks.named_parameters() if ".attn1.to_" in name or ".ff." in name]
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """None: the same attention looks over space and time."""
+        """Return nothing: the same attention looks over space and time."""
         return {}
 
     def forward(self, latent: Tensor, timestep: float) -> Tensor:

@@ -1,4 +1,4 @@
-"""A small convolutional U-Net between the latents, in the spirit of NAFNet, with paths between frames.
+"""A small convolutional U-Net between the latents, modelled on NAFNet, with layers between frames.
 
 A block follows Chen et al., "Simple Baselines for Image Restoration" (2022): a normalisation over channels, a
 widening, a 3 x 3 convolution, a product of two halves instead of an activation (SimpleGate), a projection;
@@ -20,7 +20,7 @@ from tron.neural.configs import UNetConfig
 
 
 class UNet(nn.Module):
-    """Latents of any size in, what is to be added to them out; a new one returns zeros."""
+    """Predict a correction to latents of any size; an untrained network returns zeros."""
 
     def __init__(self, config: UNetConfig, in_channels: int, out_channels: int):
         super().__init__()
@@ -38,7 +38,7 @@ class UNet(nn.Module):
 
     @property
     def stride(self) -> int:
-        """Latent pixels that sides are padded to multiples of."""
+        """Number of latent pixels to whose multiples sides are padded."""
         return self.config.patch * 2 ** (len(self.config.widths) - 1)
 
     def forward(self, latent: Tensor, timestep: float = 0.0) -> Tensor:
@@ -70,7 +70,7 @@ class UNet(nn.Module):
         return [p for name, p in self.named_parameters() if p.ndim == 2 and not name.startswith("embed")]
 
     def temporal_weights(self) -> dict[str, nn.Parameter]:
-        """Parameters of the paths between frames, by name."""
+        """Return the parameters of the layers between frames, by name."""
         return {name: p for name, p in self.named_parameters() if ".between_frames." in name}
 
 
