@@ -48,7 +48,6 @@ from train.strips import ValidationStrips
 from train.transformer_options import apply_options, require_compiler
 from tron import seeds
 from tron.cli.instantiation import make
-from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.neural.kinds import config_class
 from tron.neural.losses import RendererLoss
@@ -137,9 +136,9 @@ def _claim(
     """Hold the output folder, which must be this run's, and find where it stands; None if it is finished."""
     held.enter_context(locked(settings.output_dir))
     kept = [key for key in described if key not in MAY_CHANGE]
-    earlier = _run_folder(settings).recipe() or described
+    earlier = RunFolder(settings.output_dir).recipe() or described
     before, now = ({key: each[key] for key in kept if key in each} for each in (earlier, described))
-    _run_folder(settings).require(now, before)
+    RunFolder(settings.output_dir).require(now, before)
     position = find_position(settings.output_dir / "checkpoints", stages)
     if position.stage == len(stages) and (settings.output_dir / RENDERER_NAME).is_file():
         log.info("%s is trained already", settings.output_dir / RENDERER_NAME)
@@ -147,14 +146,9 @@ def _claim(
     return position
 
 
-def _run_folder(settings: Settings) -> RunFolder:
-    defaults = {**model_defaults(Settings), "processes": 1, "splits_sha256": {}, "start_from_sha256": None}
-    return RunFolder(settings.output_dir, defaults=defaults)
-
-
 def _keep_settings(settings: Settings, described: dict[str, Any]) -> None:
-    if _run_folder(settings).recipe() is None:
-        _run_folder(settings).keep(described)
+    if RunFolder(settings.output_dir).recipe() is None:
+        RunFolder(settings.output_dir).keep(described)
 
 
 def _make_module(

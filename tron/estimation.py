@@ -10,8 +10,6 @@ Estimator = Literal["ratio", "plain"]
 Brdf = Literal["conserving", "lambert"]
 MATERIAL = "conserving"
 """The material of path tracing, which datasets and scenes name (:mod:`tron.brdf`)."""
-MATERIAL_BEFORE = "principled"
-"""Mitsuba's material, for datasets and scenes that name none; it loses light on rough metal."""
 
 
 def require_bounces(bounces: int, reflections: int) -> None:

@@ -19,16 +19,13 @@ SHOWN_CHARACTERS = 60
 """Characters of a value in a message."""
 
 
-def first_difference(
-    before: Mapping[str, Any], now: Mapping[str, Any], defaults: Mapping[str, Any] | None = None
-) -> str | None:
+def first_difference(before: Mapping[str, Any], now: Mapping[str, Any]) -> str | None:
     """The first key in which two recipes (nested plain values) differ, as `key=old, not new`; None if none.
 
     Of a file that is known by its hash the user's key is named: `another scene (sha256 ...)`.
-    A key that `before` lacks is younger than that recipe, and has its default; without one, a key that one of
-    the two lacks counts as null.
+    A key that one of the two lacks counts as null.
     """
-    old, new = leaves(_completed(before, now, defaults or {})), leaves(now)
+    old, new = leaves(before), leaves(now)
     for key in dict.fromkeys((*new, *old)):
         if old.get(key) != new.get(key) and not ("sha256" in key and not old.get(key) and not new.get(key)):
             return _difference(key, old.get(key), new.get(key))
@@ -46,8 +43,6 @@ class RunFolder:
         what: the results in a message, such as "a dataset".
         record: name of the file that keeps the recipe.
         mend: what the user can do where the folder is another recipe's.
-        defaults: values of keys that an older program did not write, as `tron.cli.recipes.model_defaults`
-            gives them.
     """
 
     def __init__(
@@ -56,10 +51,8 @@ class RunFolder:
         what: str = "a run",
         record: str = "config.yaml",
         mend: str = CHOOSE_ANOTHER,
-        defaults: Mapping[str, Any] | None = None,
     ) -> None:
-        self.folder, self.what, self.record = folder, what, folder / record
-        self.mend, self.defaults = mend, defaults
+        self.folder, self.what, self.record, self.mend = folder, what, folder / record, mend
 
     def recipe(self) -> dict[str, Any] | None:
         """Recipe that the results were made with; None where no record is there.
@@ -83,7 +76,7 @@ class RunFolder:
     def difference(self, now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> str | None:
         """The first key in which the folder's recipe (or `before`) differs; None too where it has none."""
         before = self.recipe() if before is None else before
-        return None if before is None else first_difference(before, now, self.defaults)
+        return None if before is None else first_difference(before, now)
 
     def require(self, now: Mapping[str, Any], before: Mapping[str, Any] | None = None) -> None:
         """Raise TronError, naming the first key that differs, where the results are another recipe's.
@@ -139,19 +132,6 @@ class RunFolder:
     def has(self, *names: str) -> bool:
         """Whether all these files are there, and hence whole."""
         return all((self.folder / name).is_file() for name in names)
-
-
-def _completed(
-    before: Mapping[str, Any], now: Mapping[str, Any], defaults: Mapping[str, Any]
-) -> dict[str, Any]:
-    """`before` with the defaults of what only `now` has, at every depth that all three reach."""
-    completed = dict(before)
-    for key in now.keys() & defaults.keys():
-        if key not in before:
-            completed[key] = defaults[key]
-        elif all(isinstance(each[key], Mapping) for each in (before, now, defaults)):
-            completed[key] = _completed(before[key], now[key], defaults[key])
-    return completed
 
 
 def _difference(key: str, old: Any, new: Any) -> str:

@@ -36,7 +36,6 @@ from datagen.settings.command import SPLITS, Settings
 from datagen.truth.build import draw_and_build
 from datagen.world.scene import scene_name
 from tron.captures.folder import read_capture_folder
-from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.run_folder import RunFolder
 from tron.runtime import activate
@@ -99,7 +98,7 @@ def make_captures(settings: Settings) -> int:
 
 def captures_folder(folder: Path) -> RunFolder:
     """A folder of captures, which holds those of one recipe."""
-    return RunFolder(folder, "captures", CONFIG_NAME, defaults=model_defaults(Settings))
+    return RunFolder(folder, "captures", CONFIG_NAME)
 
 
 def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:

@@ -25,7 +25,6 @@ from datagen.run.plan import adopt, clear_temporaries, plan
 from datagen.run.store import Store
 from datagen.settings.command import Settings
 from datagen.sources import source_of
-from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.run_folder import RunFolder
 from tron.shards.schema import SCHEMA_VERSION
@@ -99,7 +98,7 @@ def _has(part: Path, item: Work) -> bool:
 def _require_part(part: Path, settings: Settings) -> None:
     """Refuse a folder that is no part of the dataset that the settings describe."""
     mend = "give folders that tron-datagen made with these settings"
-    run = RunFolder(part, "a part", CONFIG_NAME, mend, model_defaults(Settings))
+    run = RunFolder(part, "a part", CONFIG_NAME, mend)
     old = run.recipe()
     if old is None:
         raise TronError("no config.yaml, so this is no part of a dataset", part, mend)

@@ -16,7 +16,6 @@ import yaml
 from datagen.dataset.records import CONFIG_NAME, Work
 from datagen.settings.command import SPLITS, Settings
 from datagen.sources import source_of
-from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.run_folder import CHOOSE_ANOTHER, RunFolder
 from tron.shards.schema import SCHEMA_VERSION, require_schema
@@ -81,7 +80,7 @@ def require_adoptable(settings: Settings) -> None:
         TronError: the folder holds a dataset of another schema or recipe (names the key), or more scenes
             than are asked for.
     """
-    run = RunFolder(settings.output_dir, "a dataset", CONFIG_NAME, defaults=model_defaults(Settings))
+    run = RunFolder(settings.output_dir, "a dataset", CONFIG_NAME)
     old = run.recipe()
     if old is not None:
         try:

@@ -23,7 +23,6 @@ from datagen.dataset.records import CONFIG_NAME, WORK, Work
 from datagen.settings.command import Settings
 from tron.captures import Capture, LoadSettings, load_capture
 from tron.cli.instantiation import make as make_object
-from tron.cli.recipes import model_defaults
 from tron.errors import TronError
 from tron.gaussians.scene import GaussianScene
 from tron.reconstruction import Prior, Reconstruction, reconstruct
@@ -223,7 +222,7 @@ def require_reusable(settings: Settings) -> None:
     if folder is None:
         return
     mend = "leave captured.reconstructed out, or give the keys that they were made with"
-    run = RunFolder(folder, "reconstructions", CONFIG_NAME, mend, _decisive(model_defaults(Settings)))
+    run = RunFolder(folder, "reconstructions", CONFIG_NAME, mend)
     described = run.recipe()
     if described is None or described.get("recipe", {}).get("source") != "captured":
         mend = "give the folder of a dataset made with source=captured"

@@ -12,7 +12,7 @@ import numpy as np
 from tron.cameras import Camera
 from tron.flow import surface_motion
 from tron.neural.clips import Motion
-from tron.shards.moving import KEY, Moving
+from tron.shards.moving import Moving
 from tron.shards.schema import TARGET, Clip, displayed, guidance_members
 
 Region = Literal["foreground", "frame", "metal", "rest"]
@@ -35,8 +35,7 @@ class Buffers:
         images: (..., C) float32 each, linear, as stored.
         exposure: the clip's factor before the tone curve.
         motion: of the surfaces of a whole clip, from cameras and the depth of the surfels, which whoever
-            renders it has, and of the object that moves; None where that depth was not read, or an older
-            program did not say how the object moves.
+            renders it has, and of the object that moves; None where that depth was not read.
     """
 
     images: Mapping[str, np.ndarray]
@@ -47,8 +46,7 @@ class Buffers:
     @classmethod
     def of(cls, clip: Clip) -> Buffers:
         """All pixels of a clip: (K, H, W, C)."""
-        unsaid = clip.meta.extra.get("moving_object") and KEY not in clip.meta.extra
-        motion = _motion(clip) if SURFELS_DEPTH in clip.frames and not unsaid else None
+        motion = _motion(clip) if SURFELS_DEPTH in clip.frames else None
         return cls(clip.frames, clip.meta.exposure, motion)
 
     def at(self, pixels: Any) -> Buffers:

@@ -17,7 +17,7 @@ baked.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator
 from copy import copy
 from dataclasses import dataclass
 from typing import Any
@@ -45,6 +45,7 @@ from tron.shading.lighting import Lighting
 from tron.tracing import GBuffer
 from tron.tracing.gbuffer import trace_gbuffer
 from tron.tracing.hierarchy.bvh import build_bvh
+from tron.tracing.hierarchy.transmittance import Fans
 from tron.tracing.parameters import SurfelParameters, pack
 from tron.tracing.tiled.tiles import build_tiles
 
@@ -97,15 +98,11 @@ class Occluder:
     scene: GaussianScene
     transmittance: Callable[[mi.Point3f, mi.Vector3f, mi.Bool], mi.Float]
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        _normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
         """One transmittance for each direction."""
-        return [self.transmittance(origin, d, a) for d, a in zip(directions, active, strict=True)]
+        return [
+            self.transmittance(fans.origin, d, a) for d, a in zip(fans.directions, fans.active, strict=True)
+        ]
 
 
 def occluders(contenders: Contenders) -> dict[str, Occluder]:

@@ -22,12 +22,10 @@ def test_motion_is_by_the_depth_of_the_surfels(drawn_clip: Callable[..., Clip]):
     assert motion(2, 0) is motion(2, 0), "methods that ask again wait for nothing"
 
 
-def test_there_is_none_without_depth_or_without_word_of_what_moves(drawn_clip: Callable[..., Clip]):
+def test_there_is_none_without_depth(drawn_clip: Callable[..., Clip]):
     clip = drawn_clip(frames=2)
     assert Buffers.of(clip).motion is not None
-    clip.meta.extra["moving_object"] = True  # as an older program left it
-    assert Buffers.of(clip).motion is None
-    del clip.meta.extra["moving_object"], clip.frames["depth"]
+    del clip.frames["depth"]
     assert Buffers.of(clip).motion is None
 
 

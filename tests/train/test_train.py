@@ -133,17 +133,6 @@ def test_other_data_under_the_same_settings_is_another_run(train, make_dataset, 
         train(other, finished)
 
 
-def test_a_setting_that_an_older_run_did_not_know_has_its_default(train, dataset, tmp_path):
-    train(dataset, tmp_path, validation={"split": None})
-    path = tmp_path / "config.yaml"
-    kept = yaml.safe_load(path.read_text())
-    del kept["precision"], kept["optimizer"]["betas"], kept["processes"]
-    path.write_text(yaml.safe_dump(kept))
-    train(dataset, tmp_path, validation={"split": None})
-    with pytest.raises(TronError, match=r"a run made with optimizer\.betas="):
-        train(dataset, tmp_path, validation={"split": None}, optimizer={"betas": [0.5, 0.6]})
-
-
 def test_the_configuration_is_kept(train, dataset, finished):
     kept = yaml.safe_load((finished / "config.yaml").read_text())
     assert kept["optimizer"]["learning_rate"] == 1e-3

@@ -38,16 +38,13 @@ class FrameFolder:
         self.folder = folder
         self.buffers = tuple(buffers)
 
-    def claim(
-        self, made_with: Mapping[str, Any], overwrite: bool, defaults: Mapping[str, Any] | None = None
-    ) -> None:
+    def claim(self, made_with: Mapping[str, Any], overwrite: bool) -> None:
         """Take the folder for frames made with these settings (JSON values), keeping those that already are.
 
-        A setting that the record of older frames lacks had its value in `defaults`. Raises TronError if the
-        folder holds frames made with others, unless `overwrite` deletes them.
+        Raises TronError if the folder holds frames made with others, unless `overwrite` deletes them.
         """
         mend = "choose another output_dir, or replace them with overwrite=true"
-        run = RunFolder(self.folder, "frames", SETTINGS_NAME, mend, defaults)
+        run = RunFolder(self.folder, "frames", SETTINGS_NAME, mend)
         if overwrite and run.difference(made_with) is not None:
             run.clear("*.exr", "*.png", "exposure.json")
         else:

@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from copy import copy
+from dataclasses import replace
 from typing import TYPE_CHECKING, Protocol, Self
 
 import drjit as dr
@@ -19,6 +20,7 @@ from tron.gaussians.edit import joined, with_kernel
 from tron.shading.direct.irradiance import Occluder
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.hierarchy.first_hit import FirstHit
+from tron.tracing.hierarchy.transmittance import Fans
 from tron.tracing.meshes import Meshes
 from tron.tracing.tiled.kbuffer import lanes_of
 
@@ -36,19 +38,14 @@ class LimitedTracer(Occluder, Protocol):
     ) -> GBuffer: ...
 
 
-def transmittances_past(
-    meshes: Meshes,
-    surfels: Occluder,
-    origin: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    active: Sequence[mi.Bool],
-    normal: mi.Vector3f | None = None,
-) -> list[mi.Float]:
+def transmittances_past(meshes: Meshes, surfels: Occluder, fans: Fans) -> list[mi.Float]:
     """Return ``surfels.transmittances`` for rays that no mesh blocks, and 0 for the others."""
-    lanes = [mi.Bool(each) for each in active]
-    passing = [each & ~meshes.blocked(origin, along, each) for along, each in zip(directions, lanes)]
+    lanes = [mi.Bool(each) for each in fans.active]
+    passing = [
+        each & ~meshes.blocked(fans.origin, along, each) for along, each in zip(fans.directions, lanes)
+    ]
     dr.eval(passing)
-    found = surfels.transmittances(origin, directions, passing, normal)
+    found = surfels.transmittances(replace(fans, active=passing))
     return [dr.select(each & ~free, 0, value) for each, free, value in zip(lanes, passing, found)]
 
 
@@ -82,15 +79,9 @@ class LightTracer(SurfelTracer):
         other.surfels = self.surfels.turned_over(None if which is None else which[:count])
         return other
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
         """:meth:`SurfelTracer.transmittances`."""
-        return transmittances_past(self.meshes, self.surfels, origin, directions, active, normal)
+        return transmittances_past(self.meshes, self.surfels, fans)
 
 
 class BesideMeshes:
@@ -132,15 +123,9 @@ class BesideMeshes:
         """:meth:`SurfelTracer.first_hits` among the surfels of ``light``."""
         return self._light.first_hits(origin, directions, active, seeds, normal)
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
         """Return transmittances through the meshes and the surfels that a camera sees."""
-        return transmittances_past(self._light.meshes, self._seen, origin, directions, active, normal)
+        return transmittances_past(self._light.meshes, self._seen, fans)
 
 
 def some_of(values: mi.Float, first: int, count: int) -> mi.Float:

@@ -48,6 +48,7 @@ from tron.runtime import aligned
 from tron.tracing import GBuffer, SurfelTracer
 from tron.tracing.fusion import DepthMap, consensus, empty_rays, fuse, pixel_footprint
 from tron.tracing.hierarchy.first_hit import FirstHit
+from tron.tracing.hierarchy.transmittance import Fans
 from tron.tracing.surface import Surface, centres, seen_normal
 from tron.trajectories import film_around, film_with
 
@@ -329,20 +330,14 @@ class ProxiedTracer:
         """:meth:`SurfelTracer.first_hits` among the proxy's surfels."""
         return self.light.first_hits(origin, directions, active, seeds, normal)
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
         """Return transmittances through the proxy, and beyond some voxels through the scan too."""
-        near = self.light.transmittances(origin, directions, active, normal)
+        near = self.light.transmittances(fans)
         off = dr.opaque(mi.Float, self._near)
         found = []
-        for along, going, through in zip(directions, active, near, strict=True):
+        for along, going, through in zip(fans.directions, fans.active, near, strict=True):
             rest = self._scan.transmittance(
-                mi.Point3f(dr.fma(off, along, origin)), along, going & (through > 0)
+                mi.Point3f(dr.fma(off, along, fans.origin)), along, going & (through > 0)
             )
             found.append(through * rest)
         return found

@@ -42,6 +42,7 @@ from tron.shading.direct.neighbours import neighbourhood_mean
 from tron.shading.direct.sampling import PixelPoints
 from tron.shading.lighting import Lighting
 from tron.tracing.hierarchy.first_hit import NOTHING, FirstHit, ray_seeds
+from tron.tracing.hierarchy.transmittance import Fans
 from tron.tracing.surface import centres
 
 if TYPE_CHECKING:
@@ -143,9 +144,8 @@ def reflections(
             values = [share * radiance for _, share, radiance in found]
             active = [dr.max(value) > 0 for value in values]
             dr.eval(directions, values, active)
-            for value, visible in zip(
-                values, tracer.transmittances(origin, directions, active, normal), strict=True
-            ):
+            reached = tracer.transmittances(Fans(origin, directions, active, normal))
+            for value, visible in zip(values, reached, strict=True):
                 sums["light"] += value
                 sums["escaped"] += value * visible
             dr.eval(sums)

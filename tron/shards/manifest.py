@@ -2,32 +2,18 @@
 
 from __future__ import annotations
 
-import logging
-from functools import cache
 from pathlib import Path
 
 from pydantic import BaseModel, ConfigDict, Field, ValidationError
 
 from tron.errors import TronError
-from tron.estimation import MATERIAL, MATERIAL_BEFORE
+from tron.estimation import MATERIAL
 from tron.shards.dataset_folder import DatasetFolder, Place
 from tron.shards.schema import SCHEMA_VERSION, SHARD_PATTERN, require_schema
 from tron.storage import write_if_changed
 
-log = logging.getLogger(__name__)
-
 MANIFEST_NAME = "manifest.json"
 LARGEST_MANIFEST = 256 * 2**20
-
-
-@cache
-def _tell_of_material(folder: str, material: str) -> None:
-    """Once a process: a dataset is read for its manifest more often."""
-    log.warning(
-        "%s: path-traced with the material '%s', not '%s': rough metal is up to three times darker there, "
-        "everything else 5 to 8 %% brighter. A network trained on it learns that; made anew, it is right",
-        folder, material, MATERIAL,
-    )  # fmt: skip
 
 
 class ShardEntry(BaseModel):
@@ -55,7 +41,7 @@ class Manifest(BaseModel):
     Attributes:
         config_sha256: of the resolved configuration that made it, hexadecimal.
         failures: scenes and clips that could not be made.
-        material: that its pictures are path-traced with; older manifests name none.
+        material: that its pictures are path-traced with.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -64,7 +50,7 @@ class Manifest(BaseModel):
     config_sha256: str = ""
     shards: list[ShardEntry] = Field(default_factory=list)
     failures: int = Field(default=0, ge=0)
-    material: str = MATERIAL_BEFORE
+    material: str = MATERIAL
 
     @classmethod
     def load(cls, folder: Place) -> Manifest:
@@ -94,8 +80,6 @@ class Manifest(BaseModel):
             path, mend = f"{folder.rstrip('/')}/{MANIFEST_NAME}", "give the folder that tron-datagen wrote"
             raise TronError(f"manifest is damaged at '{field}': {first['msg']}", path, mend) from error
         require_schema(manifest.schema_version, folder)
-        if manifest.material != MATERIAL:
-            _tell_of_material(folder, manifest.material)
         return manifest
 
     def save(self, folder: str | Path) -> None:

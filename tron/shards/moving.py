@@ -49,16 +49,10 @@ class Moving:
         """Return the moving object of a clip; None if nothing moves.
 
         Raises:
-            TronError: the clip is of an older program, which moved an object and did not say how, or its
-                text is damaged.
+            TronError: its text is damaged.
         """
         text = meta.extra.get(KEY, "")
         if not text:
-            if KEY not in meta.extra and meta.extra.get("moving_object"):
-                raise TronError(
-                    f"clip {meta.key} does not say how its object moves",
-                    mend="make the dataset again in a new folder, with the command of its README.md",
-                )
             return None
         try:
             told = _Text.model_validate_json(text)

@@ -211,32 +211,27 @@ class SurfelTracer:
     ) -> list[FirstHit]:
         """One surfel a ray, by chance, each as likely as its weight in compositing: see :mod:`.first_hit`.
 
-        For a fan of rays from each origin, as :meth:`transmittances` has them; sides count as for shadow
-        rays. ``seeds`` of each ray: :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
+        For a fan of rays from each origin, as :class:`Fans` says; sides count as for shadow rays. ``seeds``
+        of each ray: :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
         """
-        return first_hits(self.bvh, _fans(origin, directions, active, normal), self.back_faces, seeds)
+        fans = Fans(origin, directions, active, mi.Vector3f(0) if normal is None else normal)
+        return first_hits(self.bvh, fans, self.back_faces, seeds)
 
     def transmittance(
         self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool | bool = True
     ) -> mi.Float:
         """Transmittance from ``origin`` to infinity along unit ``direction``; exactly 0 below 0.01."""
-        return self.transmittances(origin, [direction], [mi.Bool(active)])[0]
+        return self.transmittances(Fans(origin, [direction], [mi.Bool(active)]))[0]
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
         """The same for a fan of rays from each origin: quicker together, the more so the closer they are.
 
-        ``normal`` of the surface that they leave, world: the other side of a thin sheet is not in their way.
-        Evaluated at once, unless within a recorded loop.
+        The other side of a thin sheet that they leave is not in their way. Evaluated at once, unless within a
+        recorded loop.
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
-        return trace(self.bvh, _fans(origin, directions, active, normal), self.back_faces)
+        return trace(self.bvh, fans, self.back_faces)
 
 
 Seen = TypeVar("Seen", bound=Surface)
@@ -247,16 +242,6 @@ def _with_emission(seen: Seen, emission: mi.Color3f | None) -> Seen:
     if emission is None:
         return seen
     return replace(seen, values=seen.values[:-3], emission=mi.Color3f(*seen.values[-3:]))
-
-
-def _fans(
-    origin: mi.Point3f,
-    directions: Sequence[mi.Vector3f],
-    active: Sequence[mi.Bool],
-    normal: mi.Vector3f | None,
-) -> Fans:
-    """Rays of a surface, or of none."""
-    return Fans(origin, directions, active) if normal is None else Fans(origin, directions, active, normal)
 
 
 def trace_rays(

@@ -16,7 +16,7 @@ import yaml
 
 import datagen.truth.build
 from datagen.run.dataset import make
-from datagen.run.plan import adopt, plan
+from datagen.run.plan import plan
 from datagen.run.validate import validate
 from datagen.settings.command import ESTIMATED, Settings
 from datagen.settings.command_line import command_line
@@ -220,18 +220,6 @@ def test_another_recipe_is_refused_before_anything_is_written(dataset, files_of,
     with pytest.raises(TronError, match=r"path_spp=4, not 3"):
         make(tiny(dataset, "test.path_spp=3"))
     assert files_of(dataset) == before
-
-
-def test_a_key_that_an_older_dataset_did_not_know_has_its_default(tmp_path, tiny):
-    adopt(tiny(tmp_path))
-    older = yaml.safe_load((tmp_path / "config.yaml").read_text())
-    del older["recipe"]["estimator"], older["recipe"]["two_sided"], older["recipe"]["train"]["guidance_spp"]
-    (tmp_path / "config.yaml").write_text(yaml.safe_dump(older))
-    with pytest.raises(TronError, match=r"a dataset made with train\.guidance_spp=64, not 8"):
-        adopt(tiny(tmp_path, "train.guidance_spp=8"))
-    with pytest.raises(TronError, match="a dataset made with estimator=ratio, not plain"):
-        adopt(tiny(tmp_path, "train.guidance_spp=64", "estimator=plain"))
-    adopt(tiny(tmp_path, "train.guidance_spp=64"))
 
 
 def test_unknown_scenes_and_empty_datasets_are_refused(tmp_path, tiny):

@@ -26,6 +26,7 @@ from tron.relighting.proxy import (
 from tron.seeds import generator
 from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import SurfelTracer
+from tron.tracing.hierarchy.transmittance import Fans
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -217,7 +218,7 @@ def test_shadows_beyond_some_voxels_are_the_scans_too(sheets):
     upwards, every = mi.Vector3f(0, 0, 1), mi.Bool(True)
     for voxel, shadowed in ((0.2, True), (0.3, False)):
         tracer = ProxiedTracer(SurfelTracer(scan), SurfelTracer(layer), voxel=voxel)
-        (found,) = tracer.transmittances(mi.Point3f(0.01, 0.02, 0.001), [upwards], [every])
+        (found,) = tracer.transmittances(Fans(mi.Point3f(0.01, 0.02, 0.001), [upwards], [every]))
         assert (float(found[0]) < 0.5) == shadowed
 
 

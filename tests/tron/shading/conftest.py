@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from types import SimpleNamespace
 
 import drjit as dr
@@ -14,6 +14,7 @@ from tron.cameras import Camera
 from tron.shading.environments.cubemap import CubemapLight, texel_directions
 from tron.shading.environments.environment import EnvironmentMap
 from tron.tracing import GBuffer, Surface
+from tron.tracing.hierarchy.transmittance import Fans
 
 CENTRE, RADIUS = np.array([0.0, 0.0, 0.8]), 0.5
 
@@ -36,14 +37,9 @@ class SphereOverPlane:
         t = -b - dr.safe_sqrt(under)
         return dr.select((under > 0) & (t > 0) & self.sphere, t, dr.inf)
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]:
-        hits = [lanes & dr.isfinite(self._sphere_hit(origin, d)) for d, lanes in zip(directions, active)]
+    def transmittances(self, fans: Fans) -> list[mi.Float]:
+        rays = zip(fans.directions, fans.active)
+        hits = [lanes & dr.isfinite(self._sphere_hit(fans.origin, d)) for d, lanes in rays]
         return [dr.select(hit, mi.Float(0), 1) for hit in hits]
 
     def gbuffer(self, camera: Camera) -> GBuffer:

@@ -15,7 +15,6 @@ import pytest
 from tron import seeds
 from tron.cameras import Camera
 from tron.errors import TronError
-from tron.estimation import MATERIAL, MATERIAL_BEFORE
 from tron.shards import MEMBERS, ClipMeta, Manifest, ShardWriter, clip_members, read_clips, verify
 from tron.shards.reader import decode_clip, decode_meta, group_clips, tar_files
 from tron.shards.schema import SCHEMA_VERSION, members_table, meta_schema, parse_name
@@ -58,21 +57,6 @@ def write(folder: Path, keys=("a0", "a1", "a2"), per_shard: int = 2, reference: 
     manifest = Manifest(config_sha256="0" * 64, shards=writer.entries)
     manifest.save(folder)
     return manifest
-
-
-def test_a_dataset_of_another_material_is_read_and_told_of_once(tmp_path, caplog):
-    manifest = write(tmp_path)  # as datasets were before, it names no material
-    (tmp_path / "manifest.json").write_text(manifest.model_dump_json(exclude={"material"}))
-    for _ in range(2):
-        assert Manifest.load(tmp_path).material == MATERIAL_BEFORE
-        assert len(list(read_clips(tmp_path, "train"))) == 3
-    said = [record.getMessage() for record in caplog.records if "principled" in record.getMessage()]
-    assert len(said) == 1
-    assert str(tmp_path) in said[0]
-    caplog.clear()
-    manifest.model_copy(update={"material": MATERIAL}).save(tmp_path)
-    assert Manifest.load(tmp_path).material == MATERIAL
-    assert not caplog.records
 
 
 def test_round_trip_is_exact_up_to_half_precision(tmp_path):

@@ -23,7 +23,6 @@ from tron.apps.scene_file import require_file
 from tron.cameras import Camera
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
-from tron.cli.recipes import model_defaults
 from tron.denoising import require
 from tron.editing.models import foot_of, read_model
 from tron.editing.motion import Motion
@@ -79,8 +78,7 @@ def main(settings: Settings) -> None:
     log.info(clips[0].picture.describe())
     with locked(settings.output_dir):
         for light, clip in zip(lights, clips):
-            recipe = light.made_with(len(cameras), scan.turn[2])
-            clip.folder.claim(recipe, settings.overwrite, model_defaults(type(settings)))
+            clip.folder.claim(light.made_with(len(cameras), scan.turn[2]), settings.overwrite)
         with working("surfels of the models") if meshes else nullcontext():
             lit = scan.relighter(settings.estimation(), ground=ground, proxy=settings.proxy, meshes=meshes)
         trace(lit, cameras, clips, settings.seed, moving, settings.fps)

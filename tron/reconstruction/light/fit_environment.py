@@ -31,6 +31,7 @@ from tron.shading.environments.environment import EnvironmentMap
 from tron.shading.environments.prefilter import unoccluded_irradiance
 from tron.shading.guidance import Lighting, ViewTracer, render_guidance
 from tron.tracing import GBuffer, SurfelTracer
+from tron.tracing.hierarchy.transmittance import Fans
 
 POINTS_PER_VIEW = 1 << 16
 """Most surface points of a view: 64 steps' worth of the default, 256 x 256 pixels."""
@@ -442,7 +443,7 @@ class Transport:
             origin = spread(gbuffer.position) + normal * offset
             weight = dr.select(counts, weight, 0) / mi.Float(plan.count)
             dr.eval(direction, weight, origin, counts)
-        (visibility,) = tracer.transmittances(origin, [direction], [counts], mi.Vector3f(normal))
+        (visibility,) = tracer.transmittances(Fans(origin, [direction], [counts], mi.Vector3f(normal)))
         dr.eval(visibility)
         return cls(direction, weight, visibility, spp)
 

@@ -26,6 +26,7 @@ from tron.seeds import generator
 from tron.shading.direct.irradiance import ORIGIN_OFFSET, Occluder
 from tron.shading.environments.cubemap import direction_face, texel_directions
 from tron.shading.guidance import ViewTracer
+from tron.tracing.hierarchy.transmittance import Fans
 
 _FAN = 4
 _RAYS = 1 << 20  # at once
@@ -59,9 +60,8 @@ def visibility_towards(
         active, towards = _in_fans(above)[point, fan], _vectors_in_fans(along)[point, fan]
         going = [mi.Bool(aligned(active[:, k])) for k in range(_FAN)]
         vectors = [lanes(mi.Vector3f, towards[:, k]) for k in range(_FAN)]
-        seen = tracer.transmittances(
-            lanes(mi.Point3f, start[some][point]), vectors, going, lanes(mi.Vector3f, normal[some][point])
-        )
+        origin, leaves = lanes(mi.Point3f, start[some][point]), lanes(mi.Vector3f, normal[some][point])
+        seen = tracer.transmittances(Fans(origin, vectors, going, leaves))
         block = np.zeros((len(start[some]), -(-rays // _FAN), _FAN), np.float32)
         block[point, fan] = np.stack([np.array(part) for part in seen], -1) * active
         found[some] = block.reshape(len(block), -1)[:, :rays]

@@ -25,6 +25,7 @@ import mitsuba as mi
 
 from tron.errors import TronError
 from tron.shading.direct.sampling import PixelPoints
+from tron.tracing.hierarchy.transmittance import Fans
 
 if TYPE_CHECKING:
     from tron.gaussians.scene import GaussianScene
@@ -54,13 +55,7 @@ class Occluder(Protocol):
 
     scene: GaussianScene
 
-    def transmittances(
-        self,
-        origin: mi.Point3f,
-        directions: Sequence[mi.Vector3f],
-        active: Sequence[mi.Bool],
-        normal: mi.Vector3f | None = None,
-    ) -> list[mi.Float]: ...
+    def transmittances(self, fans: Fans) -> list[mi.Float]: ...
 
 
 class Light(Protocol):
@@ -124,7 +119,7 @@ def irradiance(
             active.append(counts)
             values.append(dr.select(counts, radiance * weight, 0))
         dr.eval(directions, values, active)  # tracers look at the rays more than once
-        visible = tracer.transmittances(origin, directions, active, normal)
+        visible = tracer.transmittances(Fans(origin, directions, active, normal))
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
         for observer in observers:

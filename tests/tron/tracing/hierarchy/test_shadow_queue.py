@@ -30,7 +30,7 @@ def test_the_line_changes_no_bit(random_scene, random_rays, count: int, rays: in
     active = [dr.arange(mi.UInt32, count) % 3 != ray for ray in range(rays)]
     back_faces = BackFaces.of(tracer.records, scene.spacing)
     alone = transmittance(tracer.bvh, Fans(origin, directions, active), back_faces)
-    found = tracer.transmittances(origin, directions, active)
+    found = tracer.transmittances(Fans(origin, directions, active))
     np.testing.assert_array_equal(np.array(found), np.array(alone))
     if count == 5000:
         assert 0.05 < (np.array(found) < 1).mean() < 0.95
@@ -72,12 +72,12 @@ def test_shadow_rays_go_within_recorded_loops(random_scene, random_rays):
 def test_other_numbers_of_rays_compile_nothing(random_scene, random_rays):
     tracer = SurfelTracer(random_scene(300))
     for count in (100, 1000):
-        dr.eval(tracer.transmittances(*fans(random_rays, count, 4), [mi.Bool(True)] * 4))
+        dr.eval(tracer.transmittances(Fans(*fans(random_rays, count, 4), [mi.Bool(True)] * 4)))
     origin, directions = fans(random_rays, 777, 4)
     dr.eval(origin, directions)  # copying from NumPy is a kernel for each size
     with dr.scoped_set_flag(dr.JitFlag.KernelHistory, True):
         dr.kernel_history_clear()
-        dr.eval(tracer.transmittances(origin, directions, [mi.Bool(True)] * 4))
+        dr.eval(tracer.transmittances(Fans(origin, directions, [mi.Bool(True)] * 4)))
         kernels = [k for k in dr.kernel_history() if k["type"] == dr.KernelType.JIT]
     assert kernels
     assert all(k["cache_hit"] for k in kernels)

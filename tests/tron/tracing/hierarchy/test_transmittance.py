@@ -15,6 +15,7 @@ from tron.cameras import Camera
 from tron.errors import TronError
 from tron.gaussians.edit import moved
 from tron.tracing import SurfelTracer, reference
+from tron.tracing.hierarchy.transmittance import Fans
 
 pytestmark = pytest.mark.usefixtures("variant")
 
@@ -78,9 +79,9 @@ def test_fronts_against_the_surface_that_a_ray_leaves_are_a_sheets_other_side(
     along = np.array(direction) / np.linalg.norm(direction)
     tracer = SurfelTracer(disks([along * height / along[2]], [True], opacity=0.8, sigma=0.2))
     for sided, expected in ((True, left), (False, 0.2)):
-        (found,) = tracer.sided(sided).transmittances(
-            mi.Point3f(0), [mi.Vector3f(*along.tolist())], [mi.Bool(True)], mi.Vector3f(*map(float, leaves))
-        )
+        towards, normal = mi.Vector3f(*along.tolist()), mi.Vector3f(*map(float, leaves))
+        fans = Fans(mi.Point3f(0), [towards], [mi.Bool(True)], normal)
+        (found,) = tracer.sided(sided).transmittances(fans)
         assert found[0] == pytest.approx(expected, abs=1e-4)
 
 
@@ -89,9 +90,8 @@ def test_a_sheet_is_as_thin_as_its_own_surfels_are_small(disks, radius: float, l
     """The gap is half the scene's spacing, two of the smallest surfels': fine things had no shadow in it."""
     scene = disks([[0, 0, 0.03], [3, 0, 0], [4, 0, 0]], [True] * 3, opacity=0.8, sigma=0.2)
     scene.log_scales[0] = np.log(radius)
-    (found,) = SurfelTracer(scene).transmittances(
-        mi.Point3f(0), [mi.Vector3f(0, 0, 1)], [mi.Bool(True)], mi.Vector3f(0, 0, 1)
-    )
+    up = mi.Vector3f(0, 0, 1)
+    (found,) = SurfelTracer(scene).transmittances(Fans(mi.Point3f(0), [up], [mi.Bool(True)], up))
     assert found[0] == pytest.approx(left, abs=1e-4)
 
 
@@ -104,9 +104,8 @@ def test_a_sheets_other_side_is_that_of_float64(random_rays, random_scene):
     assert (truth > plain + 0.1).sum() > 20
     arguments = (np.ascontiguousarray(each.T, np.float32) for each in (origins, directions, normals))
     origin, direction, normal = (mi.Vector3f(each) for each in arguments)
-    (found,) = SurfelTracer(scene).transmittances(
-        mi.Point3f(origin), [direction], [dr.full(mi.Bool, True, len(origins))], normal
-    )
+    fans = Fans(mi.Point3f(origin), [direction], [dr.full(mi.Bool, True, len(origins))], normal)
+    (found,) = SurfelTracer(scene).transmittances(fans)
     steady = margin > 1e-5
     np.testing.assert_allclose(np.array(found)[steady], truth[steady], atol=1e-4)
 
