@@ -46,7 +46,7 @@ def incident_exposure(frame: Frame, card: np.ndarray, look: Look = "none") -> fl
         look: of the picture.
 
     Raises:
-        TronError: no light falls on the subject and none on the card.
+        TronError: no light falls on the subject and none on the card, and nothing of it glows.
     """
     subject = frame["mask"][..., 0] > 0.5
     arriving, bounced, share = float(luminance(card)), 0.0, 1.0
@@ -60,6 +60,8 @@ def incident_exposure(frame: Frame, card: np.ndarray, look: Look = "none") -> fl
         # Where the camera looks into the light its card is black, but the rims of things are not.
         arriving = max(arriving * min(share, 1.0), 0.25 * float(direct.mean()))
     light = arriving + bounced
+    if not light > 0 and subject.any():  # what glows in the dark shows itself
+        light = float(luminance(frame["lit"][subject]).mean())
     if not light > 0:
         raise TronError("no light falls on the subject", mend="give exposure=NUMBER, or another map")
     exposure = 1.0 / light

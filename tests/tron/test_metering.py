@@ -97,6 +97,8 @@ def test_no_light_is_one_line(ball):
     dark = replace(frame, **{name: np.zeros_like(getattr(frame, name)) for name in names})
     with pytest.raises(TronError, match="no light falls on the subject"):
         incident_exposure(dark, np.zeros(3))
+    glowing = replace(dark, lit=np.full_like(dark.lit, 4.0))
+    assert incident_exposure(glowing, np.zeros(3)) == pytest.approx(0.25, rel=0.6)  # up to 0.6 stops of help
 
 
 def test_a_plane_in_the_open_is_lit_as_its_closed_form_says():

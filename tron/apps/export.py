@@ -62,9 +62,9 @@ class Settings(BaseModel):
 def main(settings: Settings) -> None:
     """Write a scene in a format of other programs.
 
-    .glb and .usdz are a mesh with textures of base color, roughness and metallic, for Blender, engines and
-    web viewers, which light it anew. Its surface is fused from what views around the scene see, or the views
-    of cameras.json beside it.
+    .glb and .usdz are a mesh with textures of base color, roughness, metallic and emission, for Blender,
+    engines and web viewers, which light it anew. Its surface is fused from what views around the scene see,
+    or the views of cameras.json beside it.
 
     The other formats are splats in the colours that they were captured with. .ply is 3DGS' own, which every
     viewer of splats and every converter reads; .spz (Niantic), .sog (PlayCanvas) and .splat are 5 to 20 times

@@ -31,7 +31,7 @@ SURFELS = 20_000
 
 Unit = Annotated[float, Field(ge=0, le=1)]
 Color = tuple[Unit, Unit, Unit]
-Factor = Annotated[float, Field(ge=0)]
+Factor = Annotated[float, Field(ge=0, allow_inf_nan=False)]
 
 
 class _Selecting(Part):
@@ -232,7 +232,7 @@ class Turned(Part):
 
 
 class Material(_Selecting):
-    """Set the materials of surfels, or scale them; what leaves [0, 1] is cut off.
+    """Set the materials of surfels, or scale them; all but emission is kept within [0, 1].
 
     Attributes:
         base_color: linear RGB, or a scale.

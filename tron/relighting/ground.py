@@ -6,7 +6,8 @@ into real scenes", 1998): the horizon stays where it is, and the ground keeps it
 Each point of it shows what the map has there, times the share of light that arrives: the map was taken when
 nothing stood there.
 
-No light is sent up from the plane to the scene: the map's lower half does that, shadows or not.
+No light is sent up from the plane to the scene: the map's lower half does that, shadows or not. Nor does what
+glows light the plane.
 """
 
 from __future__ import annotations

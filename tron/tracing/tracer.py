@@ -58,6 +58,7 @@ class SurfelTracer:
         backdrop: np.ndarray | None = None,
     ) -> None:
         self.scene, self._parameters, self._backdrop = scene, parameters, backdrop
+        self.emission = _emission(scene)
         self.records = pack(parameters or SurfelParameters.from_scene(scene)).detached()
         # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
         self.bvh = build_bvh(self._met())
@@ -86,6 +87,8 @@ class SurfelTracer:
         before, other = self.scene, copy(self)
         degree = self.records.sh_degree if scene.sh is before.sh else None
         other.scene, records = scene, pack(SurfelParameters.from_scene(scene, degree))
+        if scene.emission is not before.emission:
+            other.emission = _emission(scene)
         stay = all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in _PLACES)
         if stay and scene.kernel_degree == before.kernel_degree:  # the hierarchy is of places alone
             other.records = records
@@ -148,12 +151,6 @@ class SurfelTracer:
         if self._parameters is None or not self._parameters.differentiable():
             return self.records
         return pack(self._parameters)
-
-    @property
-    def emission(self) -> mi.Color3f | None:
-        """(M,) linear radiance that the surfels' fronts emit; None where nothing glows."""
-        emission = self.scene.emission
-        return mi.Color3f(*(mi.Float(aligned(each)) for each in emission.T)) if emission.any() else None
 
     @property
     def back_faces(self) -> BackFaces:
@@ -232,6 +229,12 @@ class SurfelTracer:
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
         trace = transmittance if recorded else queued_transmittance
         return trace(self.bvh, fans, self.back_faces)
+
+
+def _emission(scene: GaussianScene) -> mi.Color3f | None:
+    """(M,) linear radiance that the surfels' fronts emit; None where nothing glows."""
+    emission = scene.emission
+    return mi.Color3f(*(mi.Float(aligned(each)) for each in emission.T)) if emission.any() else None
 
 
 Seen = TypeVar("Seen", bound=Surface)

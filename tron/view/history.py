@@ -103,7 +103,7 @@ def _said(edit: Edit) -> str:
         return f"insert {edit.file.name}"
     if isinstance(edit, Separate):
         return f"cut out {edit.object}"
-    given = {name: getattr(edit, name, None) for name in ("base_color", "roughness", "metallic")}
+    given = {name: getattr(edit, name, None) for name in ("base_color", "emission", "roughness", "metallic")}
     words = ", ".join(
         f"{name} {value:.2f}" if isinstance(value, float) else name.replace("base_color", "color")
         for name, value in given.items()

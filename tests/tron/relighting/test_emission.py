@@ -300,6 +300,14 @@ def test_gltf_files_hold_what_glows(tmp_path: Path) -> None:
     np.testing.assert_allclose(surfels.emission[front], np.tile(expected, (front.sum(), 1)), rtol=0.01)
     assert not surfels.emission[~front].any()
 
+    def misplace(tree: dict[str, Any]) -> None:
+        tree["materials"][0]["emissiveTexture"]["texCoord"] = 3
+
+    content = mesh.export(file_type="glb", tree_postprocessor=misplace)
+    assert isinstance(content, bytes)
+    (tmp_path / "misplaced.glb").write_bytes(content)
+    assert load_model(tmp_path / "misplaced.glb")[0].emission is None
+
 
 def test_a_mesh_of_surfels_glows_as_they_do(dense_surfels) -> None:
     sheet = dense_surfels.plane(0.1, 1.0)

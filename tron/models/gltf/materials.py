@@ -241,19 +241,25 @@ def _from_specular(read: _Reader, glossy: dict[str, Any]) -> Material:
 
 
 def _glow(result: Material, read: _Reader, material: dict[str, Any]) -> None:
-    """Give a material what it emits; an image that lies on other texture coordinates has its mean."""
+    """Give a material what it emits; an image on other texture coordinates has its mean, on none nothing.
+
+    Images of emission are mostly black: their factor alone would make a lamp of the whole part.
+    """
     strength = material.get("extensions", {}).get("KHR_materials_emissive_strength", {})
     factor = _factor(material.get("emissiveFactor", (0.0, 0.0, 0.0)), (3,))
     emission = factor * max(_finite(strength.get("emissiveStrength", 1.0)), 0.0)
-    use = read.use(material.get("emissiveTexture")) if emission.any() else None
-    if use is not None:
+    texture = material.get("emissiveTexture") if emission.any() else None
+    use = read.use(texture)
+    if use is None and texture is not None:
+        emission = np.zeros(3)
+    elif use is not None:
         emission = _LINEAR[read.image(use)[..., :3]] * emission.astype(np.float32)
         if all(other.texcoord == use.texcoord for other in result.uses.values()):
             result.uses["emission"] = use
         else:
             emission = emission.mean((0, 1))
     if emission.any():
-        result.emission = emission.astype(np.float32)
+        result.emission = emission.astype(np.float32, copy=False)
     else:
         result.uses.pop("emission", None)
 

@@ -8,8 +8,9 @@ surfel, its specular lobe included, and L what it emits, k bounces are the sum
 
 over the n rays of face i that meet one: I is the irradiance / pi of indirect light, a (E + I) + L what a face
 sends out, the same in all directions; L is that of fronts alone. Without bounces what glows lights nothing.
-Faces are the M fronts and the backs that rays meet: undersides that no
-camera saw, with light of their own. Rays are stopped as in
+Few rays of a surfel meet a lamp, so where something glows, I is averaged among neighbours in the end. Faces
+are the M fronts and the backs that rays meet: undersides that no camera saw, with light of their own. Rays
+are stopped as in
 :mod:`tron.tracing.hierarchy.first_hit`, so each estimates the composited radiance without bias.
 
 Memory: 4 bytes a ray are kept, 128 MB of a million surfels with 32 rays each. While rays are traced,
