@@ -300,7 +300,7 @@ class Settings(BaseModel):
             del said["file"]
             said["sha256"] = sha256(model.file)
         if self.denoiser is None:
-            del made["denoise"]  # `filtered` says it
+            made["denoise"] = self.estimation().filtered  # what null comes to
         if (filmed := self.scene.with_name(CAMERAS)).is_file():
             made["filmed_sha256"] = sha256(filmed)
         if is_of_capture(self.light, self.scene):

@@ -51,7 +51,7 @@ def test_the_relit_picture_alone_is_denoised(relight, base, tmp_path, capsys):
     assert relight(*base, "denoise=oidn", f"output_dir={tmp_path / 'raw'}") == 2
     assert "denoise=True, not oidn" in capsys.readouterr().err
     assert relight(*base, f"output_dir={tmp_path / 'clean'}") == 2
-    assert "denoise=oidn, not None" in capsys.readouterr().err
+    assert "denoise=oidn, not True" in capsys.readouterr().err
 
 
 def test_the_default_checkpoint_gives_way(relight, base, tmp_path, caplog):
