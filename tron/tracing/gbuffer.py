@@ -78,7 +78,7 @@ class GBuffer(Surface):
 
     def rows(self) -> Surface:
         """The pixels row by row; differentiable."""
-        return Surface(**{"values": []} | self.in_rows(self._fields()))
+        return Surface(**{"values": []} | self.in_rows(_held(self)))
 
     def image(self, value: Any) -> np.ndarray:
         """Numbers of each lane (Dr.Jit) as (H, W) or (H, W, C) float32."""
@@ -92,10 +92,7 @@ class GBuffer(Surface):
 
     def numpy(self) -> dict[str, np.ndarray]:
         """Every field as (H, W), (H, W, 3) or, where there are C ``values``, (H, W, C) float32."""
-        return self.images(self._fields())
-
-    def _fields(self) -> dict[str, Any]:
-        return _held(self)
+        return self.images(_held(self))
 
     def _pixels(self, value: Any) -> np.ndarray:
         if isinstance(value, mi.Float):

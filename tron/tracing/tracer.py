@@ -48,6 +48,7 @@ class SurfelTracer:
 
     Attributes:
         records: the surfels as every kernel reads them, without gradients. bvh: their hierarchy.
+        emission: (M,) mi.Color3f, linear radiance that their fronts emit; None where nothing glows.
     """
 
     def __init__(
@@ -152,6 +153,11 @@ class SurfelTracer:
             return self.records
         return pack(self._parameters)
 
+    def _with(self, values: Sequence[mi.Float]) -> SurfelRecords:
+        """The records with ``values`` to composite, and after them what the surfels emit, if any does."""
+        glow = () if self.emission is None else self.emission
+        return pack_values(self.attached(), [*values, *glow])
+
     @property
     def back_faces(self) -> BackFaces:
         return self._beyond if self._two_sided else BackFaces.never()
@@ -170,16 +176,15 @@ class SurfelTracer:
             limit: distance along each ray, in tile order, beyond which no surfel counts, world units: what is
                 opaque there hides the rest; None: there is nothing.
         """
-        emission = self.emission
-        records = pack_values(self.attached(), values if emission is None else [*values, *emission])
+        records = self._with(values)
         projection = PROJECTIONS[self.scene.projection]
         if projection is None:
-            return _with_emission(trace_view(records, camera, limit), emission)
+            return _with_emission(trace_view(records, camera, limit), self.emission)
         nearest = min(NEAREST, NEAREST_SPACINGS * self.scene.spacing)
         deviations = np.exp(self.scene.log_thickness)
         thickness = mi.Float(aligned(deviations) if len(deviations) else 0)
         seen = projected(records, camera, projection, nearest, thickness)
-        return _with_emission(trace_view(seen, camera, limit, records), emission)
+        return _with_emission(trace_view(seen, camera, limit, records), self.emission)
 
     def trace(
         self,
@@ -193,10 +198,9 @@ class SurfelTracer:
         The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
         camera rays fast; ``values`` as there.
         """
-        emission = self.emission
-        records = pack_values(self.attached(), values if emission is None else [*values, *emission])
+        records = self._with(values)
         seen = trace_rays(records, self.bvh, origin, direction, mi.Bool(active))
-        return _with_emission(seen, emission)
+        return _with_emission(seen, self.emission)
 
     def first_hits(
         self,
