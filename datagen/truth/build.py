@@ -177,7 +177,8 @@ def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels
     bsdf: Any = mi.load_dict({"type": "normalmap", "normalmap": normal_map, "bsdf": material})
     # Cloth, leaves and walls are open; a back face that renders black would not match its surfels.
     bsdf = mi.load_dict({"type": "twosided", "bsdf": bsdf})
-    mesh = mitsuba_mesh("solids", bsdf, *(np.concatenate(part) for part in (vertices, normals, faces, uvs)))
+    points, directions, triangles, places = map(np.concatenate, (vertices, normals, faces, uvs))
+    mesh = mitsuba_mesh("solids", bsdf, points, directions, triangles, places)
     return Surface(mesh, material, normal_map, np.concatenate(ids))
 
 
