@@ -65,10 +65,11 @@ class LossSettings(BaseModel):
         "gain nothing. Lower it with data.mend; otherwise frames that are already right "
         "dominate the loss.",
     )
-    gradient: float = Field(
+    sharpness: float = Field(
         default=0.0,
         ge=0,
-        description="Weight of the absolute error of differences between neighbours: edges and relief.",
+        description="Weight of what gradients lack of the truth's strength, in windows of 16 x 16 pixels: "
+        "errors of values alone are least where unknown detail is blurred.",
     )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(
