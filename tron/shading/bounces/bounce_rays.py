@@ -97,7 +97,7 @@ class SurfelRays:
     Their origins and hits follow surfels that move: :meth:`after`.
 
     Attributes:
-        met: mi.UInt32 (rays x M), ray r of surfel i at r M + i: twice the surfel met, plus 1 if its back is met,
+        met: mi.UInt32 (rays x M), ray r of surfel i at r M + i: twice the surfel met, plus 1 at its back,
             plus ``OWN`` if it is the ray's own sheet; or ``NOTHING``. See :func:`surfel_met`.
     """
 
