@@ -241,7 +241,7 @@ def shade_surface(
     """Shade the surfaces that rays see, given the light that reaches them.
 
     Bounced light is included if ``surface`` has the values of a bake (``BouncedLight.values``).
-    ``background``: as in :func:`render_guidance`. Returns colours of :class:`Guidance` by name, a lane per ray.
+    ``background``: as in :func:`render_guidance`. Returns :class:`Guidance` colours by name, a lane per ray.
     """
     response = Response.of(surface, lighting.split_sum, brdf)
     irradiance = response.unshadowed * arriving.visibility
