@@ -15,7 +15,7 @@ from tron.shards.dataset_folder import DatasetPlace
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 
 HELD_OUT = "test"
-"""The split that evaluation judges by; so are those whose names begin with it, as test_relit."""
+"""The split used by evaluation; splits whose names begin with it, such as test_relit, are too."""
 
 
 class OptimizerSettings(BaseModel):
@@ -135,7 +135,7 @@ class DataSettings(BaseModel):
 
 
 class ValidationSettings(BaseModel):
-    """Clips whose PSNR is shown while training; nothing is selected or stopped by it."""
+    """Clips whose PSNR is shown during training; it selects no checkpoint and stops nothing early."""
 
     DEFAULT: ClassVar[str] = "validation"
 
@@ -160,16 +160,16 @@ class ValidationSettings(BaseModel):
     )
 
 
-# Half of the samples come from stage 1's split, against forgetting it.
+# Half of the samples come from stage 1's split, so that it is not forgotten.
 _REHEARSED: dict[str, Any] = {"rehearsal_split": "train", "rehearsal_ratio": 0.5, "learning_rate": 0.5}
 THREE_STAGES = [
     Stage(name="synthetic", split="train", steps=3000, crop=64),
     Stage(name="adapt", split="train_b", steps=1000, crop=64, **_REHEARSED),
     Stage(name="video", split="train_b", frames=5, steps=1000, batch_size=4, crop=64, **_REHEARSED),
 ]
-"""The paper's curriculum; a second path-traced split of another distribution replaces real photographs.
+"""The paper's curriculum, with a second path-traced split of another distribution for real photographs.
 
-It shows that the curriculum works, not what real data would add.
+It shows that the curriculum works, but not the gain from real data.
 """
 
 
@@ -305,17 +305,17 @@ def _require_training_split(name: str, split: str | None) -> None:
 
 @dataclass(frozen=True)
 class SplitPlace:
-    """A dataset's folder or URL, and the names of those of its splits that are one here."""
+    """A dataset's folder or URL, and the names of its splits that are joined into one."""
 
     folder: str
     splits: tuple[str, ...]
 
     @classmethod
     def parse(cls, name: str, value: str) -> SplitPlace:
-        """Place of the split that a run calls ``name``: FOLDER or FOLDER#SPLIT or FOLDER#SPLIT+SPLIT.
+        """Parse the place of the split that a run calls ``name``: FOLDER[#SPLIT[+SPLIT...]].
 
         Raises:
-            ValueError: it is none of these, or names a split twice.
+            ValueError: the text has another form, or names a split twice.
         """
         folder, mark, joined = value.rpartition("#")
         splits = tuple(joined.split("+")) if mark else (name,)
