@@ -24,7 +24,7 @@ HEIGHT = 96
 
 
 def irradiance(lights: Sequence[EnvironmentMap], normals: np.ndarray) -> list[np.ndarray]:
-    """Return irradiance / pi under each light on unoccluded surfaces of unit ``normals`` (N, 3): sums over texels.
+    """Return irradiance / pi under each light on unoccluded surfaces of unit ``normals`` (N, 3), from texels.
 
     Returns:
         (N, 3) float64 for each light.
@@ -41,7 +41,7 @@ def texels(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray]:
 
 
 def brightest_direction(light: EnvironmentMap) -> np.ndarray:
-    """Return the unit direction (3,) of the brightest spot: the light's centre in the brightest SPOT_DEG cone.
+    """Return the unit direction (3,) of the brightest spot: centre of the light in the cone with most light.
 
     The centre of the light in the cone, not of the cone, is finer than a texel.
     """

@@ -154,7 +154,7 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
 
 
 def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Return errors of irradiance after one factor, for all scenes and by kind of light, and of sun directions.
+    """Return errors of irradiance after one factor, overall and by kind of light, and of sun directions.
 
     All lights without a sun are soft: finding a disk in the sky is another task than finding a glow.
     """

@@ -68,7 +68,7 @@ def collect_thick(way: str, folder: Path, capture: Path, truths: Sequence[Path])
 def relit_figures(relighter: Relighter, views: Sequence[View], truths: Sequence[Path]) -> dict[str, float]:
     """Return means over lights of ``relight_psnr`` and ``irradiance_psnr`` (dB), and shares of pixels.
 
-    The shares are ``specks``, ``leaks`` (see the module) and ``half``: pixels with less than half of their light.
+    The shares are ``specks``, ``leaks`` (see the module) and ``half``: pixels below half of their light.
 
     Args:
         relighter: the scan.

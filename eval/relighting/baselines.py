@@ -5,7 +5,7 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 
 - ``pbr``: D(B).
 - ``pbr_x_irradiance``: D(o s B e E + (1 - o) B), one scalar s, fitted. Irradiance is exposed too, as
-  everywhere else, so that s means the same under a dim and a bright light; where no surfel is, both buffers
+  everywhere else, so that s means the same under dim and bright lights; where no surfel is, both buffers
   hold the environment, which must not be squared.
 - ``shadow_ratio``: D(B E / E0), the ratio being clamped (see :func:`shadow_ratio`).
 - ``shadowed``: kd E + split-sum specular, stored with the data.
@@ -27,8 +27,8 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 
 Baselines with lit in their names use bounced light; the others use direct light from the environment.
 ``lit.supersampled`` and ``lit.reflections`` are ``lit`` at a higher cost per frame: with 2 x 2 sub-pixels,
-and with reflection rays as well. Networks and blends do not see them, so they are no baselines; their rows show
-the best picture without a network.
+and with reflection rays as well. Networks and blends do not see them, so they are no baselines; their rows
+show the best picture without a network.
 
 Blends and s are fitted on the foreground of training data (:mod:`eval.relighting.fits`). A blend fitted to
 surfaces is wrong for the sky. On full frames, blends and pixel networks are therefore composited over pbr,

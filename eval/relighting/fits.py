@@ -119,7 +119,7 @@ class AffineFit:
         self._square += (target**2).sum(0)
 
     def solve(self) -> Fitted:
-        """Return the least-squares weights, (3 output channels, inputs + 1); the last column is the constant."""
+        """Return the least-squares weights, (3 output channels, inputs + 1); the constant is last."""
         weights = self.weights()
         return Fitted(self.shown_by(weights), weights)
 

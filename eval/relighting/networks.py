@@ -107,7 +107,7 @@ def guided(
 def drawn(
     network: Network, light: Illumination, cameras: Sequence[Camera], exposure: float, seed: int
 ) -> np.ndarray:
-    """Render a lit scene by a network, (K, H, W, 3) display values; several frames are averaged along motion."""
+    """Render a lit scene by a network, (K, H, W, 3) display values; several are averaged along motion."""
     from tron.neural.renderer import render_clip
 
     given = guided(network, light, cameras, exposure, seed)

@@ -1,7 +1,7 @@
 """Metrics of every method on every held-out frame, and their rows.
 
-A metric is computed on each displayed frame and then averaged over frames; this holds for PSNR too, which is
-not taken of an average error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has no finite
+A metric is computed on each displayed frame and then averaged over frames. PSNR is averaged too, not computed
+from a mean error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has no finite
 PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes (:mod:`eval.confidence`), whose
 frames and lights are no independent observations; a gain's is of the differences on the same frames.
 
@@ -247,7 +247,7 @@ class Scores:
         return next((method for method in self.methods if method in NETWORKS), None)
 
     def best(self, methods: Sequence[str], where: Where = ALL, figure: str = "psnr") -> str | None:
-        """Return the method with the best mean of a metric; None if a method that is not OPTIONAL was not scored.
+        """Return the method with the best mean of a metric; None unless all but OPTIONAL ones were scored.
 
         For BEST_OF_ALL it is the best of the scored methods.
         """
@@ -262,14 +262,14 @@ class Scores:
     ) -> float | None:
         """Return the gain of a method in the mean of a metric over the best of others.
 
-        None where one is not known.
+        None if either mean is unknown.
         """
         ours, best = self.mean(method, where, figure), self.best(over, where, figure)
         reached = None if best is None else self.mean(best, where, figure)
         return None if ours is None or reached is None else SIGNS[figure] * (ours - reached)
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
-        """Return rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with the tail of :class:`Where`.
+        """Return rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with tails of :class:`Where`.
 
         ``seed`` draws the scenes of the intervals.
         """

@@ -72,7 +72,7 @@ def frame_shadow_pixels(frame: dict[str, np.ndarray], judged: np.ndarray) -> Sha
 
 
 def both_have_surface(frames: dict[str, np.ndarray]) -> np.ndarray:
-    """Return pixels where truth and surfels have a surface: (..., H, W) bool, from ``foreground`` and ``mask``."""
+    """Return pixels where truth and surfels have a surface: (..., H, W) bool."""
     return (frames["foreground"][..., 0] > 0.5) & (frames["mask"][..., 0] > 0.5)
 
 

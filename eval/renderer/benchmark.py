@@ -119,7 +119,7 @@ class Run:
         self._judge("synthetic", "", sizes, TEST, FIT)
 
     def models(self) -> None:
-        """Measure gains on real models at every size and quality; the largest frames also with few surfels."""
+        """Measure gains on real models at every size and quality; largest frames also with few surfels."""
         largest, scores = max(self.settings.models), dict[bool, Scores]()
         for size in self.settings.models:
             made: dict[tuple[bool, Quality], Path] = {
@@ -140,7 +140,7 @@ class Run:
             self.outcome.add([row] if row else [])
 
     def _models_of(self, size: int, quality: Quality, few: bool, dataset: Path, truths: Truths) -> Judged:
-        """Add rows of one size, quality and number of surfels; show the largest frames with default surfels."""
+        """Add rows of one size, quality and number of surfels; show largest frames with default surfels."""
         first = size == min(self.settings.models) and quality == "preview"
         network = self.networks.get(NEURAL_LIT.name)
         identity = None if network is None else Identity(network, truths.linear)
@@ -184,7 +184,7 @@ class Run:
         return {kind: self.networks[name] for name, kind in KINDS.items() if name in self.networks}
 
     def _judge(self, name: str, prefix: str, sizes: Mapping[int, Path], split: str, fit_split: str) -> None:
-        """Measure gains on one distribution; figures without a size are of the first, pictures of the largest."""
+        """Measure gains on one distribution; figures without a size use the first, pictures the largest."""
         judged = {size: self._judged(dataset, split, fit_split) for size, dataset in sizes.items()}
         self._add(prefix, judged)
         self.gains += over_lit(next(iter(judged.values())).scores, self.settings.seed)
@@ -210,7 +210,7 @@ class Run:
         per_pixel: bool = True,
         identity: Identity | None = None,
     ) -> Judged:
-        """Judge every method on one data set, materials too; ``per_pixel``: train per-pixel networks on it.
+        """Judge all methods on one data set, materials too; ``per_pixel``: train per-pixel networks on it.
 
         The truth is the mean of all renders, which also give sharpness; identity is measured on the same clips.
         """
