@@ -136,7 +136,7 @@ _ABSOLUTE = re.compile(r"(?<![\w./:~])(?:/[\w.@+-]+)+(?=/[\w.@+-]+/[\w.@+-]+)/")
 
 
 def portable(value: Any) -> Any:
-    """Return JSON with paths reduced to their last folder and name: folders of a machine mean nothing elsewhere."""
+    """Return JSON with paths reduced to last folder and name: other machines have other folders."""
     if isinstance(value, str):
         return _ABSOLUTE.sub("", value)
     if isinstance(value, dict):
@@ -181,7 +181,7 @@ class Results(BaseModel):
         return None if row is None else row.value
 
     def held_to(self, targets: Iterable[Target]) -> Results:
-        """Return a copy with the targets; rows have their target as ``reference``, ``ratio`` = value / target."""
+        """Return a copy with the targets; rows get it as ``reference``, and ``ratio`` = value / target."""
         targets = list(targets)
         by_metric = {target.metric: target for target in targets}
 

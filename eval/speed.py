@@ -1,9 +1,10 @@
 """Benchmark `speed`: frames per second of every way to light a scene, and seconds until an edit is seen.
 
 The camera turns around a small world of surfels under a sun. All ways take turns in one process
-(:mod:`eval.timing`); a figure is a median of rounds. A frame ends when its picture is in host memory. Work that
-does not depend on the camera is done before: hierarchies, transport, the bake of the light. An edit redoes the
-part of this work that it changes. The paper's figures are shown beside ours, with the paper's machine.
+(:mod:`eval.timing`); a figure is a median of rounds. A frame ends when its picture is in host memory. Work
+that does not depend on the camera is done before: hierarchies, transport, the bake of the light. An edit
+redoes the part of this work that it changes. The paper's figures are shown beside ours, with the paper's
+machine.
 """
 
 from __future__ import annotations
@@ -196,7 +197,7 @@ class Lights:
         self._thing = ids == np.unique(ids)[-1]
 
     def under(self, estimation: Estimation) -> Illumination:
-        """Return the light by an estimation; estimations with equal bounces share all but the rays per pixel."""
+        """Return the light by an estimation; estimations of equal bounces share all but the pixels' rays."""
         from tron.relighting import Relighter
 
         kind = estimation.bounces
@@ -307,7 +308,7 @@ def orbit(size: int, seed: int, steps: int = 60) -> list[Camera]:
 
 
 def passes(network: Network, size: int, seed: int) -> dict[str, Callable[[], None]]:
-    """Return name in rows -> call: a network on one frame of random buffers, or a training step of its copy."""
+    """Return name in rows -> call: a network on a frame of random buffers, or a training step of a copy."""
     import torch
 
     def noise() -> Iterator[torch.Tensor]:

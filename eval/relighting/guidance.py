@@ -78,13 +78,13 @@ class GuidanceScores:
                 self.normal_error.append((meta.scene, metrics.angular_error_deg(ours, truth, both)))
 
     def rows(self, seed: int = 0) -> list[Row]:
-        """Return rows ``guidance.*`` (overall and ``.FAMILY``) and ``surfels.*``; unmeasured ones have no row.
+        """Return rows ``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*`` of what was measured.
 
-        ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames. The two fractions are
-        over the pixels of all frames together, because a frame may have hardly any shadow. Pixels are judged
-        where surfels and truth show the same surface by distance; ``_same_normal`` decides by normals, and
-        ``_with_silhouettes`` also judges pixels with different surfaces.
-        ``seed`` draws the scenes of the intervals.
+        ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames. The two fractions
+        are over the pixels of all frames together, because a frame may have hardly any shadow. Pixels are
+        judged where surfels and truth show the same surface by distance; ``_same_normal`` decides by normals,
+        and ``_with_silhouettes`` also judges pixels with different surfaces. ``seed`` draws the scenes of the
+        intervals.
         """
         irradiance = [
             mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)

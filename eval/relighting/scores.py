@@ -1,9 +1,10 @@
 """Metrics of every method on every held-out frame, and their rows.
 
 A metric is computed on each displayed frame and then averaged over frames. PSNR is averaged too, not computed
-from a mean error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has no finite
-PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes (:mod:`eval.confidence`), whose
-frames and lights are no independent observations; a gain's is of the differences on the same frames.
+from a mean error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has
+no finite PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes
+(:mod:`eval.confidence`), whose frames and lights are no independent observations; a gain's is of the
+differences on the same frames.
 
 A new metric is one more entry of METRICS: rows and tables iterate over it.
 """
@@ -121,7 +122,7 @@ class Where(NamedTuple):
 
     @property
     def tail(self) -> str:
-        """End of the rows' names: ``_full`` for full frames, ``_metal``, ``_rest``; ``.FAMILY`` or ``.STYLE``."""
+        """End of rows' names: ``_full`` (full frames), ``_metal``, ``_rest``; ``.FAMILY`` or ``.STYLE``."""
         return self.tail_after("")
 
     def tail_after(self, size: str) -> str:
@@ -269,7 +270,7 @@ class Scores:
         return None if ours is None or reached is None else SIGNS[figure] * (ours - reached)
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
-        """Return rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with tails of :class:`Where`.
+        """Return rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with :class:`Where`'s tails.
 
         ``seed`` draws the scenes of the intervals.
         """

@@ -210,9 +210,10 @@ class Run:
         per_pixel: bool = True,
         identity: Identity | None = None,
     ) -> Judged:
-        """Judge all methods on one data set, materials too; ``per_pixel``: train per-pixel networks on it.
+        """Judge all methods on a data set, materials too; ``per_pixel``: train per-pixel networks on it.
 
-        The truth is the mean of all renders, which also give sharpness; identity is measured on the same clips.
+        The truth is the mean of all renders, which also give sharpness; identity is measured on the same
+        clips.
         """
         paths = self.datasets.pixel_mlps(dataset, fit_split) if per_pixel else []
         trained = [load_networks("pixel_mlp", [path]) for path in paths]

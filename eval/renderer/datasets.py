@@ -57,26 +57,26 @@ class RendererSettings(Benchmark):
     threads: PositiveInt = Field(default=1, description="CPU threads of the networks")
     renderer: Path | list[Path] | None = Field(
         default=None,
-        description="checkpoint that is judged: a file or a shipped name; [a,b]: one with lit, one of the "
-        "paper's two buffers; null: both that are shipped",
+        description="checkpoint to judge: a file or a shipped name; [a,b]: one with lit, one of the paper's "
+        "two buffers; null: both shipped checkpoints",
     )
     data: dict[str, Path] = Field(
         default={},
-        description="data sets that are there already, by the names that this benchmark gives its own: "
+        description="existing data sets, under the names of this benchmark's own: "
         "synthetic_128, models_128_preview, models_512_few_final, captures, shadows",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
     real_data: Path | None = Field(description="folder with assets and hdri; null: no models")
-    models: Sizes = Field(description="width of a frame -> recipe of scenes of those models")
+    models: Sizes = Field(description="width of a frame -> recipe of scenes of the models")
     qualities: dict[Quality, Recipe] = Field(
-        description="quality of tron-relight -> what it adds to the recipes of models; each has another "
-        "path_spp, with other passes, so that the truth is rendered twice",
+        description="quality of tron-relight -> further arguments for the recipes of models; path_spp "
+        "differs in each, so that the truth is rendered twice",
         min_length=1,
     )
     few_surfels: Recipe | None = Field(
         default=None,
-        description="what is added to that for the largest frames, made again with as few surfels as small "
-        "frames have; null: without them",
+        description="further arguments to make the largest frames again with as few surfels as small "
+        "frames have; null: not made",
     )
     captures: CaptureRecipes = Field(description="recipes of held-out captures")
     shadows: Recipe = Field(description="recipe of clips with a moving occluder")
@@ -85,8 +85,8 @@ class RendererSettings(Benchmark):
     )
     pixel_mlp: Recipe | None = Field(
         default=None,
-        description="arguments of tron-train for the per-pixel baselines, trained on the training split of "
-        "each test distribution that has one; null: without them",
+        description="arguments of tron-train for per-pixel baselines on the training split of each test "
+        "distribution that has one; null: no such baselines",
     )
     pictures: NonNegativeInt = Field(
         default=3, description="number of scenes of each distribution on the page"
@@ -231,7 +231,7 @@ def _quoted(name: str) -> str:
 
 
 def _names(folder: Path, suffixes: Sequence[str]) -> list[str]:
-    """Return the names by which tron-datagen knows a folder's files, subfolders included, suffix case ignored.
+    """Return the names of a folder's files for tron-datagen, subfolders included, suffixes in any case.
 
     The name is the stem, or the path without the suffix if several files share the stem.
     """

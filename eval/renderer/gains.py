@@ -2,8 +2,8 @@
 
 The network of the paper's two buffers is compared with the best baseline of direct light: baselines of pbr
 and irradiance alone and, harder, baselines that also see unshadowed irradiance and shadowed shading, from
-which the two buffers are made. ``over_two_buffers`` is the gain over the former alone. The network that starts
-from lit is compared with lit and all fits on it.
+which the two buffers are made. ``over_two_buffers`` is the gain over the former alone. The network that
+starts from lit is compared with lit and all fits on it.
 """
 
 from __future__ import annotations

@@ -46,7 +46,8 @@ class Identity:
     def rows(self, start: str, tail: str, seed: int) -> list[Row]:
         """Return rows of the mean over frames, dB; none if nothing was judged.
 
-        ``start`` is the prefix of the figure's name, ``tail`` the suffix; ``seed`` draws the intervals' scenes.
+        ``start`` is the prefix of the figure's name, ``tail`` the suffix; ``seed`` draws the intervals'
+        scenes.
         """
         return [mean_row(f"{start}{NAME}{tail}", "dB", self.found, seed)] if self.found else []
 

@@ -1,9 +1,9 @@
 """Sharpness: mean squared gradient of a picture over the truth's, in display values.
 
 The gradient is the differences of neighbouring pixels, along rows and along columns. The truth's squared
-gradient is the mean product of the gradients of two renders (of every pair, if there are more): their noise is
-independent, so the mean product estimates a truth without noise. A picture's noise counts as sharpness: read
-it beside the PSNR.
+gradient is the mean product of the gradients of two renders (of every pair, if there are more): their noise
+is independent, so the mean product estimates a truth without noise. A picture's noise counts as sharpness:
+read it beside the PSNR.
 """
 
 from __future__ import annotations

@@ -62,7 +62,7 @@ class Truths:
         return displayed(TARGET, self.linear(clip), clip.meta.exposure)
 
     def rows(self, clips: Iterable[Clip], metric: str, tail: str, seed: int) -> list[Row]:
-        """Return rows of the PSNR of a perfect picture against the mean, from the mean's noise in display values.
+        """Return rows of a perfect picture's PSNR against the mean, from the mean's noise in display values.
 
         Args:
             clips: judged clips, with ``foreground``; clips with one render are ignored.

@@ -41,7 +41,7 @@ def main(job: str) -> None:
 
 
 def _set_up(scene: Any, told: dict[str, Any]) -> None:
-    """Set up path tracing without denoising, clamping or smoothing, with a box filter and a black background."""
+    """Set up path tracing without denoising, clamping or smoothing; box filter, black background."""
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.seed = told["samples"], told["seed"]
     scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
