@@ -24,15 +24,20 @@ class Zoo(Benchmark):
 
     name: ClassVar[str] = "zoo"
 
-    parts: list[Part] = Field(description="parts to measure", min_length=1) seed: int = Field(default=0,
-    description="seed; targets are for 0, other seeds are for development") variant: str =
-    Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU") threads: PositiveInt |
-    None = Field(default=None, description="threads of Dr.Jit and Cycles; null: one per core") shapes:
-    list[Kind] = Field(description="kinds of shapes", min_length=1) lights: list[str] | None =
-    Field(default=None, description="names of lights; null: all") materials: PositiveInt | None =
-    Field(default=None, description="maximum number of materials per shape; null: all") real_data: Path | None
-    = Field(description="folder with hdri; without it maps are drawn") denoisers: bool = Field(default=True,
-    description="measure denoisers and the shipped network too") blender_python: Path | None = Field(
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
+    seed: int = Field(default=0, description="seed; targets are for 0, other seeds are for development")
+    variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
+    threads: PositiveInt | None = Field(
+        default=None, description="threads of Dr.Jit and Cycles; null: one per core"
+    )
+    shapes: list[Kind] = Field(description="kinds of shapes", min_length=1)
+    lights: list[str] | None = Field(default=None, description="names of lights; null: all")
+    materials: PositiveInt | None = Field(
+        default=None, description="maximum number of materials per shape; null: all"
+    )
+    real_data: Path | None = Field(description="folder with hdri; without it maps are drawn")
+    denoisers: bool = Field(default=True, description="measure denoisers and the shipped network too")
+    blender_python: Path | None = Field(
         default=None, description="Python with bpy, in an environment of its own; null: no Cycles"
     )
 
