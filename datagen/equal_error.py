@@ -92,7 +92,7 @@ def _surfels(settings: Settings, item: Work) -> Path:
 def _judge_scene(
     spec: SceneSpec, geometry: Geometry, scene: GaussianScene, settings: Settings
 ) -> list[dict[str, Any]]:
-    """Yield a case for each light of the scene."""
+    """Return a case for each light of the scene."""
     recipe, wanted = settings.split(spec.split), settings.equal_error
     relighter = Relighter(scene, proxy="never")
     copy(relighter).prepare()  # compiles it

@@ -150,7 +150,7 @@ class Run:
 
     @cached_property
     def worlds(self) -> list[Judged]:
-        """Return the worlds with their truth."""
+        """The worlds with their truth."""
         from eval.applications.worlds import draw_world, view_of
 
         s, found = self.settings, []
@@ -164,7 +164,7 @@ class Run:
 
     @cached_property
     def networks(self) -> dict[str, Network]:
-        """Return method name -> checkpoint."""
+        """The checkpoints, by method name."""
         return load_networks("neural", self.settings._weights())
 
     def rays(self) -> None:

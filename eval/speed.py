@@ -296,7 +296,7 @@ def _neural(seed: int, network: Network, light: Illumination, cameras: Sequence[
 
 
 def orbit(size: int, seed: int, steps: int = 60) -> list[Camera]:
-    """Yield square views of the world, one degree apart."""
+    """Return square views of the world, one degree apart."""
     from eval.applications.worlds import view_of
 
     first = view_of(generator(seed, "speed", "camera"), size, size)

@@ -191,7 +191,7 @@ def index_page(title: str, rows: Sequence[ClipRow], links: Mapping[str, str]) ->
 
 
 def tone_tables() -> dict[str, Any]:
-    """Return tables from which the page computes display values: AgX of ``tron.color``, and the preview code."""
+    """Return tables for the page's display values: AgX of ``tron.color``, and the code of previews."""
     stops = np.linspace(*AGX_LOG2_RANGE, AGX_SAMPLES + 1)
     curve = agx(np.repeat(2.0 ** stops[:, None], 3, axis=1))[:, 0]  # a grey is the same after the inset
     return {

@@ -51,7 +51,7 @@ class Work:
 
 
 def starts(count: int, frames: int) -> list[int]:
-    """Return the first photos of clips in a row of ``count``; the last clip ends with the row, and may overlap.
+    """Return the first photos of clips in a row of ``count``; the last clip ends the row and may overlap.
 
     >>> starts(12, 5), starts(4, 5)
     ([0, 5, 7], [])

@@ -64,7 +64,7 @@ class Asset(BaseModel):
     contents: tuple[Content, ...] = ()
 
     def hashes(self) -> frozenset[str]:
-        """Hashes that make it the same as another asset that shares one."""
+        """Hashes of the asset; two assets that share one are the same."""
         return compared(self.contents) or frozenset([self.sha256])
 
 

@@ -74,7 +74,7 @@ def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Cont
 
 
 def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
-    """Return the files that a model refers to, with links followed; missing ones are left to its reader."""
+    """Yield the files that a model refers to, with links followed; missing ones are left to its reader."""
     named: list[tuple[str, ContentKind]] = []
     if path.suffix.lower() == ".obj":
         yield from _of_obj(path)
@@ -106,7 +106,7 @@ def _of_obj(path: Path) -> Iterator[tuple[Path, ContentKind]]:
 
 
 def texture_kind(path: Path) -> ContentKind:
-    """Return ``plain`` for an image of one colour, such as a flat normal map; unreadable images are textures."""
+    """Return ``plain`` for an image of one colour, such as a flat normal map; unreadable: texture."""
     try:
         with Image.open(path, formats=_READ) as image:
             require_size(image.width, image.height)

@@ -124,7 +124,7 @@ class SourceList(BaseModel):
 
 
 def slots(settings: Settings, sources: Sources) -> Filled | None:
-    """Compare the settings' checklist with their files; None without a checklist; TronError as in reading it."""
+    """Compare the settings' checklist with their files; None without one; TronError if it is unreadable."""
     if settings.checklist is None:
         return None
     return filled(read_checklist(settings.checklist), sources.maps, sources.assets)
@@ -273,7 +273,7 @@ def families(contents: Sequence[Collection[str]]) -> np.ndarray:
 
 
 def for_split(items: Sequence[Item], split: str, hashes: Callable[[Item], Collection[str]]) -> list[Item]:
-    """Return the assets of a split: one in HELD_OUT families is for the test split; too few are shared.
+    """Return a split's assets: one in HELD_OUT families is for the test split; if too few, all are shared.
 
     Validation uses the assets of training: holding out more would reduce training.
 
@@ -310,7 +310,7 @@ def require_disjoint(settings: Settings, sources: Sources) -> None:
 
 
 def overlaps(own: SourceList, other: SourceList, folder: Path) -> Iterator[str]:
-    """Return a line for each source and split shared with the training splits of ``other``."""
+    """Yield a line for each source and split shared with the training splits of ``other``."""
     there: dict[str, tuple[Source, str]] = {}
     for source in other.sources:
         if set(source.splits) & set(TRAINED):
@@ -336,7 +336,7 @@ def _compared(source: Source) -> list[Content]:
 
 
 def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:
-    """Return a line for each scene with the same specification as a training scene of the other dataset."""
+    """Yield a line for each scene with the same specification as a training scene of the other dataset."""
     own = dict(_scenes(output))
     for folder in others:
         trained = dict(_scenes(folder, TRAINED))
@@ -346,7 +346,7 @@ def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:
 
 
 def _scenes(folder: Path, splits: Collection[str] | None = None) -> Iterator[tuple[str, str]]:
-    """Return hash of a scene's specification, without its place -> its name."""
+    """Yield hash (of the specification without PLACE) and name of each scene."""
     for path in sorted(folder.glob("scenes/*/spec.json")):
         try:
             spec = json.loads(path.read_bytes())

@@ -30,7 +30,7 @@ class SurfelBudget(NamedTuple):
 
     @property
     def view_pixels(self) -> int:
-        """Pixels of one view."""
+        """Number of pixels of one view."""
         return self.view_width * self.view_height
 
 

@@ -49,7 +49,7 @@ class Window:
         return self.picture.window(self.x, self.y, self.width, self.height)
 
     def with_margin(self) -> Window:
-        """The part and what lies within :data:`MARGIN` of it, as far as the picture goes."""
+        """Return the window with :data:`MARGIN` around it, inside the picture."""
         left, top = max(self.x - MARGIN, 0), max(self.y - MARGIN, 0)
         right = min(self.x + self.width + MARGIN, self.picture.width)
         bottom = min(self.y + self.height + MARGIN, self.picture.height)

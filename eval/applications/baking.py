@@ -79,7 +79,7 @@ def measure_baking(folders: Sequence[Path], seed: int, outcome: Outcome) -> None
 
 
 def baking_rows(found: Sequence[Baked], seed: int) -> Iterator[Row]:
-    """Return means over scenes of a kind, losses by other kernels, and the figures of every scene."""
+    """Yield means over scenes of a kind, losses by other kernels, and the figures of every scene."""
     for kind in KINDS:
         of_kind = [each for each in found if each.kind == kind]
         for name in DRAWN:

@@ -89,7 +89,7 @@ def measure_harmonising(seed: int, outcome: Outcome) -> None:
 
 
 def harmonising_rows(found: Sequence[Composite], seed: int) -> Iterator[Row]:
-    """Return PSNR of inserting and of pasting on judged pixels, at and beside the thing, and the gains."""
+    """Yield PSNR of inserting and of pasting on judged pixels, at and beside the thing, and the gains."""
     gains = {}
     for prefix, title in METHODS.items():
         for part, where in (("", "judged"), ("thing_", "thing"), ("cast_", "cast")):

@@ -67,7 +67,7 @@ def measure_motion(seed: int, outcome: Outcome) -> None:
 
 
 def motion_rows(films: Sequence[Film], seed: int) -> Iterator[Row]:
-    """Return correlation and slope over all changes of all films, and PSNR on surfaces."""
+    """Yield correlation and slope over all changes of all films, and PSNR on surfaces."""
     for prefix in QUALITIES:
         scenes, sums = [], []
         for each in films:

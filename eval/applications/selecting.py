@@ -124,7 +124,7 @@ def measure_selections(folders: list[Path], seed: int, outcome: Outcome) -> None
 
 
 def selection_rows(draws: list[Draw], seed: int) -> Iterator[Row]:
-    """Return mean and median IoU and the share of good selections; ``seed`` draws the intervals' scenes."""
+    """Yield mean and median IoU and the share of good selections; ``seed`` draws the intervals' scenes."""
     yield mean_row("select.iou", "1", [(draw.scene, draw.iou) for draw in draws], seed)
     ious = [draw.iou for draw in draws]
     yield Row(metric="select.iou_median", value=float(np.median(ious)), unit="1", n=len(ious))
@@ -139,7 +139,7 @@ def selection_rows(draws: list[Draw], seed: int) -> Iterator[Row]:
 
 
 def seconds_rows(seed: int) -> Iterator[Row]:
-    """Return seconds of a selection among LARGE surfels, clicks included; the first one builds the tracer."""
+    """Yield seconds of a selection among LARGE surfels, clicks included; the first one builds the tracer."""
     world = draw_world(seed, "large", 0, "soft", things=5)
     clicked = Clicked("large", world.surfels(LARGE))
     wall, processor = [], []

@@ -161,7 +161,7 @@ def find_methods(given: Path | Sequence[Path], suite: Suite) -> list[MethodFolde
 
 
 def rows_of(judged: Sequence[Judged], scenes: set[str], seed: int) -> Iterator[Row]:
-    """Return rows of means, gains and p-values; a mean over all scenes needs all scenes.
+    """Yield rows of means, gains and p-values; a mean over all scenes needs all scenes.
 
     - ``METHOD.FIGURE``: mean over all pictures of all scenes, if no scene failed; ``.GROUP`` is
       for one kind of scene or family of lights. If any method failed anywhere, ``METHOD.FIGURE_common``
@@ -203,7 +203,7 @@ def rows_of(judged: Sequence[Judged], scenes: set[str], seed: int) -> Iterator[R
 
 
 def _pairs(judged: Sequence[Judged], common: set[str], seed: int) -> Iterator[Row]:
-    """Return the gain of the better of every two methods on the common scenes, with p-values."""
+    """Yield the gain of the better of every two methods on the common scenes, with p-values."""
     by_method = {each.name: _by_picture(each.frames, common) for each in judged}
     gains: list[Row] = []
     differences: list[np.ndarray] = []

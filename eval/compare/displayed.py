@@ -35,7 +35,7 @@ def methods_and_truth(given: Path | Sequence[Path], suite: Suite) -> dict[str, M
 def displayed(
     suite: Suite, scene: SuiteScene, folder: MethodFolder | None
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Return light -> pictures (K, H, W, 3) of a method, or of the suite for None; display float32.
+    """Yield light -> pictures (K, H, W, 3) of a method, or of the suite for None; display float32.
 
     Pictures are prepared as in benchmark=compare: with the factor of methods that ask for one, and with the
     known truth behind the subject unless both have the environment there.

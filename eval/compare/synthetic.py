@@ -83,7 +83,7 @@ class Synthetic(Benchmark):
 
 
 def gains(rows: Mapping[str, Row]) -> Iterator[Row]:
-    """Return rows of the two gains from rows of the comparison; no row if a method is absent."""
+    """Yield rows of the two gains from rows of the comparison; no row if a method is absent."""
     ours = [name.removesuffix(".faults") for name in rows if name.endswith(".faults")]
     others = [name for name in ours if name.startswith(WITHOUT) and name != NETWORK]
     # A method with a fault has no mean, and no best is sought among those that happen to have one.

@@ -167,7 +167,7 @@ def measure_mesh(
 
 
 def mesh_rows(views: Sequence[View]) -> Iterator[Row]:
-    """Return means over views; maps do not depend on the light and count once."""
+    """Yield means over views; maps do not depend on the light and count once."""
     once = [view for view in views if view.light == views[0].light]
     base = [capped_psnr(v.seen.base_color, v.truth.base_color, v.filled) for v in once]
     normal, smooth = (

@@ -140,7 +140,7 @@ def before(parts: Sequence[Part], side: int) -> Camera:
 
 
 def model_rows(pairs: Sequence[Pair]) -> Iterator[Row]:
-    """Return rows of each pair, of their mean and of the worst."""
+    """Yield rows of each pair, of their mean and of the worst."""
     for pair in pairs:
         case = f"{pair.model}_{pair.light}".replace("-", "_").lower()
         yield Row(metric=f"blender.psnr.{case}", value=pair.psnr, unit="dB", n=1)

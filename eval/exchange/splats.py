@@ -293,7 +293,7 @@ class Splats:
     lacking: dict[str, str] = field(default_factory=dict)
 
     def rows(self, seed: int) -> Iterator[Row]:
-        """Return means over worlds, with intervals drawn by ``seed``."""
+        """Yield means over worlds, with intervals drawn by ``seed``."""
         for name in ("degree2", "both_sides"):
             if found := getattr(self, name):
                 yield mean_row(f"format.{name}.psnr", "dB", _by_world(found), seed)

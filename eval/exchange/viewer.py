@@ -53,7 +53,7 @@ class Viewed:
     harmonics: list[tuple[str, float]] = field(default_factory=list)
 
     def rows(self, seed: int) -> Iterator[Row]:
-        """Return rows ``viewer.*``; ``seed`` draws the intervals."""
+        """Yield rows ``viewer.*``; ``seed`` draws the intervals."""
         every = [*self.own, *self.harmonics]
         if self.own:
             yield mean_row("viewer.psnr", "dB", self.own, seed)

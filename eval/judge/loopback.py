@@ -101,7 +101,7 @@ def made_pictures(seed: int) -> tuple[np.ndarray, Picture]:
 
 
 def check_rows(folder: Path, seed: int) -> Iterator[Row]:
-    """Return rows of both known judges, and whether position bias is found only in the biased one."""
+    """Yield rows of both known judges, and whether position bias is found only in the biased one."""
     truth, picture = made_pictures(seed)
     scenes = {"made": (["lamp"], len(truth))}
     asked = controls(scenes, seed) + questions(scenes, BETTER, [WORSE], len(truth), [seed])

@@ -84,7 +84,7 @@ def spoiled(picture: np.ndarray) -> np.ndarray:
 
 
 def pairs(asked: Sequence[Question]) -> Iterator[tuple[Question, Question]]:
-    """Return both orders of each pair; the order that shows the first-named method first comes first.
+    """Yield both orders of each pair; the order that shows the first-named method first comes first.
 
     Raises:
         ValueError: a pair was asked in one order only.

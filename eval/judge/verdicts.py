@@ -99,7 +99,7 @@ class Fitness:
         )
 
     def rows(self, prefix: str = "judge") -> Iterator[Row]:
-        """Return rows of the judge's fitness; ``prefix`` names the judge."""
+        """Yield rows of the judge's fitness; ``prefix`` names the judge."""
         figures = {
             "control_share": self.controls,
             "control_won": float(self.control_won),
@@ -115,7 +115,7 @@ class Fitness:
 
 
 def rival_rows(found: Found, ours: str, rival: str, seeds: Sequence[int], seed: int) -> Iterator[Row]:
-    """Return our win rate over a rival, its deviation over seeds, ties, and Wilcoxon's test over scenes.
+    """Yield our win rate over a rival, its deviation over seeds, ties, and Wilcoxon's test over scenes.
 
     Ties are half a win; invalid answers are left out, and ``n`` counts valid ones.
     """

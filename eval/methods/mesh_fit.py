@@ -215,7 +215,7 @@ def lit_frames(
 
 
 def surface_maps(mesh: PaintedMesh, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Return linear base color and unit world normals (H, W, 3) at pixel centres; 0 off the mesh."""
+    """Yield linear base color and unit world normals (H, W, 3) at pixel centres; 0 off the mesh."""
     scene = mesh.lit(EnvironmentMap.constant(1.0))
     for camera in cameras:
         along = camera.rays().reshape(-1, 3)

@@ -210,7 +210,7 @@ def _require_true_maps(suite: Suite) -> None:
 
 
 def _true_views(scene: SuiteScene) -> Iterator[GBufferView]:
-    """Return G-buffers of the training views."""
+    """Yield G-buffers of the training views."""
     for view in read_capture_folder(scene.train).views:
         depth, normal = view.read("depth"), view.read("normal")
         yield GBufferView(

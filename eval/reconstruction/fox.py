@@ -44,7 +44,7 @@ class Fox:
     light: np.ndarray | None
 
     def rows(self) -> Iterator[Row]:
-        """Return figures of the reconstruction, and the time to relight it."""
+        """Yield figures of the reconstruction, and the time to relight it."""
         report = self.run.report
         for name, key, unit in (("test_psnr", "psnr", "dB"), ("ssim", "ssim", "1"), ("lpips", "lpips", "1")):
             if key in report.test:
@@ -64,7 +64,7 @@ class Fox:
             yield Row(metric="fox.relight_seconds", value=self.relit_seconds, unit="s", n=len(self.relit))
 
     def pictures(self) -> Iterator[tuple[str, Pictures]]:
-        """Return file name -> group: held-out photos beside the surfels, and a group for each other light."""
+        """Yield file name -> group: held-out photos beside the surfels, and a group for each other light."""
         for name, photo in self.photos.items():
             psnr = self.run.report.views.get(name, {}).get("psnr")
             pictures = [Picture(photo, "photo", f"held-out photo {name} of the fox")]

@@ -133,7 +133,7 @@ def light_family(capture: Path) -> str:
 
 
 def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Return means over the scenes with intervals, then the figures of every scene.
+    """Yield means over the scenes with intervals, then the figures of every scene.
 
     For seconds and surfels, the maximum replaces the mean and has no interval. A figure that any scene lacks
     has no mean, because the mean would be over other scenes than its neighbours. ``seed`` draws the scenes of
@@ -154,7 +154,7 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
 
 
 def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Return errors of irradiance after one factor, overall and by kind of light, and of sun directions.
+    """Yield errors of irradiance after one factor, overall and by kind of light, and of sun directions.
 
     All lights without a sun are soft: finding a disk in the sky is another task than finding a glow.
     """

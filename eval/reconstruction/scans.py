@@ -110,7 +110,7 @@ def collect_scan(name: str, scene: Path, capture: Path, truths: Sequence[Path], 
 
 
 def scan_rows(way: str, scans: Sequence[Scan], seed: int = 0) -> Iterator[Row]:
-    """Return means over the scans: ``splats.*`` reconstructed, ``splats.raw.*`` for the files as they are."""
+    """Yield means over the scans: ``splats.*`` reconstructed, ``splats.raw.*`` for the files as they are."""
     prefix = "splats" if way == "splats" else f"splats.{way}"
     for figure in ("normal_mae_deg", "normal_median_deg"):
         yield mean_row(

@@ -95,7 +95,7 @@ def relit_figures(relighter: Relighter, views: Sequence[View], truths: Sequence[
 
 
 def thick_rows(ways: Mapping[str, Mapping[str, float]]) -> Iterator[Row]:
-    """Return rows ``splats.thick.*``: the carried scan, the file (``raw_*``, ``raw_today_*``), and the gain.
+    """Yield rows ``splats.thick.*``: the carried scan, the file (``raw_*``, ``raw_today_*``), and the gain.
 
     ``ways`` are keys of PROXY -> figures by :func:`collect_thick`.
     """
@@ -114,7 +114,7 @@ def thick_rows(ways: Mapping[str, Mapping[str, float]]) -> Iterator[Row]:
 def _of_shadows(
     frame: Guidance, view: View, normal: np.ndarray, light: EnvironmentMap, exposure: float
 ) -> Iterator[tuple[str, float]]:
-    """Return the shadow figures of a frame with known true normals (H, W, 3)."""
+    """Yield the shadow figures of a frame with known true normals (H, W, 3)."""
     where = (view.read("mask") == 1) & normal.any(axis=-1)
     arrived, shown, of = view.read("irradiance"), frame["irradiance"], frame["unshadowed"]
     (open_,) = irradiance([light], normal[where])

@@ -107,7 +107,7 @@ class GuidanceScores:
 
 
 def shadow_rows(tail: str, counted: Sequence[tuple[str, np.ndarray]], seed: int) -> Iterator[Row]:
-    """Return rows of the FRACTIONS of pixels; ``counted`` are (scene, counts of ShadowPixels) per frame."""
+    """Yield rows of the FRACTIONS of pixels; ``counted`` are (scene, counts of ShadowPixels) per frame."""
     counts = np.array([pixels for _, pixels in counted], float).reshape(len(counted), 4)
     of_scenes = scene_sums([scene for scene, _ in counted], counts)
     for metric, (bad, of) in FRACTIONS.items():

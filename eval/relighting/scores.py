@@ -270,7 +270,7 @@ class Scores:
         return None if ours is None or reached is None else SIGNS[figure] * (ours - reached)
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
-        """Return rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with :class:`Where`'s tails.
+        """Yield rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with :class:`Where`'s tails.
 
         ``seed`` draws the scenes of the intervals.
         """

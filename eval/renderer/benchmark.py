@@ -110,7 +110,7 @@ class Run:
 
     @cached_property
     def networks(self) -> dict[str, Network]:
-        """Return method name -> checkpoint."""
+        """The checkpoints, by method name."""
         return load_networks("neural", self.settings.weights())
 
     def synthetic(self) -> None:

@@ -57,7 +57,7 @@ Scored = Mapping[str, Sequence[ClipScore]]
 
 
 def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
-    """Return RMS warping errors of methods, and ratios and gains of averages over single frames.
+    """Yield RMS warping errors of methods, and ratios and gains of averages over single frames.
 
     Figures without a checkpoint's name are of the checkpoint that starts from lit, tron-relight's default.
     Its averages are also compared with averages of lit.

@@ -46,7 +46,7 @@ WORST_OVER = {f"worst_scene_over_{name}_db": [each.name] for name, each in DENOI
 
 
 def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: bool = False) -> Iterator[Row]:
-    """Return gains, PSNRs and SSIMs, overall and by family and style, for foreground and full frames.
+    """Yield gains, PSNRs and SSIMs, overall and by family and style, for foreground and full frames.
 
     Args:
         prefix: prefix of the word gain in names of rows: "", "ood_", "final_" or "capture_".
@@ -77,7 +77,7 @@ def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: b
 
 
 def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """Return the spread over single scenes of the foreground gain over the best rival.
+    """Yield the spread over single scenes of the foreground gain over the best rival.
 
     Rows are the gain without the scene that raises it most, and the share of the gain that remains (0 without
     gain); and the least gain of a scene over the scene's best rival, over the network's start picture and,
@@ -106,7 +106,7 @@ def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Ro
 
 
 def seen_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """Return SSIM and FLIP of every method, and gains; unlike PSNR these do not reward blur."""
+    """Yield SSIM and FLIP of every method, and gains; unlike PSNR these do not reward blur."""
     known = {each.name: scores.of(each.name, Where()) for each in scores.methods}
     for figure in ("ssim", "flip"):
         if not all(figure in score.figures for found in known.values() for score in found):
@@ -123,7 +123,7 @@ def seen_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row
 
 
 def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """Return PSNRs and gains on metals and on other materials, over frames that have them.
+    """Yield PSNRs and gains on metals and on other materials, over frames that have them.
 
     ``rest`` is the gain without metals, so it shows whether metals carry the mean. PSNRs are of the networks,
     lit and denoisers.
@@ -163,14 +163,14 @@ def between(metric: str, method: str, scores: Scores, other: Scores, seed: int) 
 
 
 def time_rows(prefix: str, seconds: Mapping[str, Sequence[float]], size: int) -> Iterator[Row]:
-    """Return median seconds per frame of every timed method, without making the guidance."""
+    """Yield median seconds per frame of every timed method, without making the guidance."""
     for method, found in seconds.items():
         name = f"renderer.{prefix}seconds.{method.replace('.', '_')}.{size}"
         yield Row(metric=name, value=float(np.median(found)), unit="s", n=len(found))
 
 
 def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
-    """Return the least of each single-scene row of the network that starts from lit, over all data."""
+    """Yield the least of each single-scene row of the network that starts from lit, over all data."""
     found = list(rows)
     for end in (WORST, WORST_OVER_INPUT, *WORST_OVER, KEPT):
         pattern = re.compile(rf"renderer\.lit\.([a-z]+_)*{end}(\.\d+)?")

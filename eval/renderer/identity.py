@@ -53,7 +53,7 @@ class Identity:
 
 
 def least_identity(rows: Iterable[Row]) -> Iterator[Row]:
-    """Return the least figure over all sizes and qualities: ``renderer.identity_psnr``.
+    """Yield the least figure over all sizes and qualities: ``renderer.identity_psnr``.
 
     Validation is left out: its truths are single renders.
     """

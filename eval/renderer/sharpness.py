@@ -66,7 +66,7 @@ class Gradients:
 
 
 def sharpness_rows(prefix: str, scores: Scores, rivals: Sequence[str], tail: str, seed: int) -> Iterator[Row]:
-    """Return the sharpness of the network that starts from lit, of lit, each denoiser and the best rival.
+    """Yield the sharpness of the network that starts from lit, of lit, each denoiser and the best rival.
 
     Rows of the network's sharpness over each denoiser's follow.
 

@@ -23,7 +23,7 @@ from tron.shards.schema import TARGET
 
 
 def validation_rows(dataset: Path, split: str, network: Network, size: int, seed: int) -> Iterator[Row]:
-    """Return mean foreground gains over lit for each quality, dB, and identity errors.
+    """Yield mean foreground gains over lit for each quality, dB, and identity errors.
 
     Rows are for a network (``QUALITY_gain_db``) and for each installed denoiser that needs only guidance
     (``QUALITY_oidn_gain_db``). checkpoint=auto uses the lower ends of their intervals. ``seed`` draws the

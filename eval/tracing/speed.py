@@ -165,7 +165,7 @@ def measure_shadow(contenders: Contenders, size: int, rays: int, spp: int, seed:
 
 
 def shadow_rows(timed: Timed, rays: int, pass_rays: int) -> Iterator[Row]:
-    """Return rows of rays per second and ratios, for random rays and for the pass, then builds.
+    """Yield rows of rays per second and ratios, for random rays and for the pass, then builds.
 
     TRON's build is in the ratios; the peers' builds are not. The time of the pass with no occluder is
     subtracted from both sides.

@@ -154,7 +154,7 @@ def surfaces_of(scene: SuiteScene) -> Surfaces:
 def steadiness_rows(
     method: str, clips: Sequence[Clip], truth: Sequence[Clip] | None, seed: int
 ) -> Iterator[Row]:
-    """Return RMS figures over all clips, and mean squares over the truth's mean squares, with intervals."""
+    """Yield RMS figures over all clips, and mean squares over the truth's mean squares, with intervals."""
     for measure in MEASURES:
         of_method: list[Difference] = [getattr(each.steadiness, measure) for each in clips]
         n = sum(each.pixels for each in of_method)
@@ -169,7 +169,7 @@ def steadiness_rows(
 
 
 def vbench_rows(method: str, scores: Mapping[str, Mapping[str, float]], seed: int) -> Iterator[Row]:
-    """Return means over clips, named SCENE.LIGHT, with intervals over scenes."""
+    """Yield means over clips, named SCENE.LIGHT, with intervals over scenes."""
     for dimension, by_clip in scores.items():
         found = [(name.partition(".")[0], value) for name, value in by_clip.items()]
         yield mean_row(f"vbench.{dimension}.{method}", "fraction", found, seed)

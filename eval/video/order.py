@@ -66,7 +66,7 @@ def spoiled(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
 
 
 def order_rows(seed: int) -> Iterator[Row]:
-    """Return rows of three measures of four clips, plain frame differences, and ``video.order_correct``."""
+    """Yield rows of three measures of four clips, plain frame differences, and ``video.order_correct``."""
     cameras, depth, truth = made_clip()
     surfaces = Surfaces.of(surface_motion(cameras, depth.__getitem__), depth > 0)
     clips = spoiled(truth, seed)

@@ -17,7 +17,7 @@ BALL = "ball"
 
 
 def zoo_rows(cells: Sequence[Cell]) -> Iterator[Row]:
-    """Return all rows of cells; rows of balls only if there are balls."""
+    """Yield all rows of cells; rows of balls only if there are balls."""
     off = np.array([[abs(cell.mean(quality) - 1) for quality in QUALITIES] for cell in cells])
     errors = np.array([[cell.error(quality) for quality in QUALITIES] for cell in cells])
     yield _row("worst_mean", off.max(), len(cells))
@@ -45,7 +45,7 @@ def zoo_rows(cells: Sequence[Cell]) -> Iterator[Row]:
 
 
 def _ball_rows(balls: Sequence[Cell], lights: Sequence[str]) -> Iterator[Row]:
-    """Return rows of the balls' targets, and means of groups of materials under each light."""
+    """Yield rows of the balls' targets, and means of groups of materials under each light."""
     preview = next(iter(QUALITIES))
     shiny = [(cell, preview) for cell in balls if cell.material.metallic and cell.material.roughness < ROUGH]
     others = [(cell, quality) for cell in balls for quality in QUALITIES if (cell, quality) not in shiny]
