@@ -442,7 +442,7 @@ class Settings(ScaleSettings):
         return [surfels_by_pixels(width * height)._replace(**chosen) for width, height in pictures]
 
     def surfel_budget(self, split: str, scene: int = 0) -> SurfelBudget:
-        """That of one scene, which draws one of the sizes.
+        """Return the surfel budget of one scene, which draws one of the sizes.
 
         Its surfels are then larger than the pixels of some windows and smaller than those of others.
         """
@@ -469,7 +469,7 @@ class Settings(ScaleSettings):
         return self.model_dump(mode="json", include=CAPTURED)
 
     def pseudo_capture_recipe(self) -> dict[str, Any]:
-        """Return the keys that decide a pseudo-capture's content, as plain values; only splits with scenes."""
+        """Return the keys that decide a pseudo-capture's content, as plain values; used splits only."""
         splits = dict.fromkeys(self.used_splits(), OF_A_SCENE)
         shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
         values = self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
@@ -522,7 +522,7 @@ class KeysOfSynthetic:
         return [name for name in SPLITS if self.split(settings, name).scenes]
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """All keys but those of captures and of the run; of the splits that have scenes.
+        """Return all keys except the keys of captures and of the run; only splits with scenes.
 
         Surfels and their views are numbers, split by split: another law of them is another recipe.
         """
@@ -608,7 +608,7 @@ def _first_difference(name: str, value: Any, default: Any) -> str:
 
 
 def part_of(items: Sequence[Item], shard: str | None) -> list[Item]:
-    """The items that ``shard=i/n`` makes: i - 1, i - 1 + n, ...; all of them without it.
+    """Return the items of ``shard=i/n``: i - 1, i - 1 + n, ...; all without it.
 
     Raises:
         TronError: there are fewer items than parts, so that some would be empty.

@@ -126,7 +126,7 @@ class SplitSettings(SettingsModel):
         return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
 
     def rays_of(self, light: int, order: Callable[[int], np.ndarray]) -> Rays:
-        """What ``guidance_spp`` says of the clip under light number ``light``.
+        """Return ``guidance_spp`` for the clip under light number ``light``.
 
         Args:
             order: a number of things -> an order of theirs that the scene drew, so that neither its style

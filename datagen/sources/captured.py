@@ -120,7 +120,7 @@ class CapturedSource(Source):
         return settings.captured.reconstruction.radiance.density.most
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
-        """Return the cost of steps, none for a reused reconstruction, and of guidance; it grows with photos."""
+        """Return the cost of steps (none for a reused reconstruction) and of guidance at the photos' size."""
         captured = settings.captured
         how = captured.reconstruction
         steps = how.steps_scaler * (how.radiance.steps + how.materials.steps)

@@ -82,7 +82,7 @@ def made_clips(
 
 
 def usable_rows(item: Work, settings: Settings, capture: Capture) -> list[list[View]]:
-    """Photos in rows that are long enough for a clip.
+    """Return rows of photos that are long enough for a clip.
 
     Raises:
         TronError: there are none, or a photo of them is smaller than a frame.
@@ -134,8 +134,8 @@ def light_ratio(photo: Photo, lit: np.ndarray, seen: np.ndarray) -> np.ndarray:
     """Return log ratios (N,) of photo radiance, by inverse AgX, over ``lit`` at some surface pixels.
 
     Training and evaluation look at guidance through AgX, at photos as they are. So the exposure that makes
-    guidance as bright as the photos is measured against light that AgX would show as them, whatever curve
-    they went through.
+    guidance as bright as the photos is measured against radiance that AgX would display as the photos,
+    whatever their real tone curve.
 
     Args:
         photo: the truth.
@@ -273,7 +273,7 @@ class Photo:
 
 
 def rows_of_photos(capture: Capture) -> list[list[View]]:
-    """Training views in rows without a gap, in the order of their names, numbers in them as numbers.
+    """Return training views in rows without gaps, in the natural order of their names.
 
     A photo that was skipped or held out ends a row.
     """

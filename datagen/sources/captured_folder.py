@@ -1,4 +1,4 @@
-"""The captures in a folder, which split each is in, and where the path-traced truth of each lies.
+"""The captures in a folder, their splits, and the folders of their path-traced truth.
 
 ``captured.relit=FOLDER`` is the folder ``relit`` of pseudo-captures: a capture folder for each capture and
 light, ``NAME_1_sun``, with linear radiance, masks and the light itself as environment.exr. ``captured.truth``
@@ -72,7 +72,7 @@ def find_captures(settings: Settings) -> dict[str, int]:
 
 
 def count_photos(folder: Path) -> int:
-    """About how many photos a capture has: its pictures in the folder that has most of them.
+    """Estimate the number of a capture's photos: the pictures in its folder with most of them.
 
     Copies of other sizes, masks and maps lie in folders of their own, and are no more than the photos.
     """
@@ -106,7 +106,7 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
 
 
 def split_by_name(names: Sequence[str]) -> dict[Split, list[str]]:
-    """Split -> names of its captures, sorted, by what stands before the hyphen in each.
+    """Return split -> sorted names of its captures, by the part before the hyphen in each name.
 
     Raises:
         TronError: a name that begins with no split's.

@@ -213,7 +213,7 @@ FOUND = (SURFELS_NAME, ENVIRONMENT_NAME)
 
 
 def require_reusable(settings: Settings) -> None:
-    """Make sure that ``captured.reconstructed`` is a dataset of captures, reconstructed as this one would be.
+    """Require that ``captured.reconstructed`` is a dataset of captures with the same reconstruction settings.
 
     Raises:
         TronError: it is not; names the first key that differs.

@@ -94,7 +94,7 @@ class Source(Protocol):
         ...
 
     def kept_bytes(self, settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
-        """Bytes that finished scenes keep, as if nothing compressed: shards if asked for, previews, surfels.
+        """Return uncompressed bytes of finished scenes: optionally shards, previews, surfels.
 
         Half-precision EXR hardly compresses noise.
         """

@@ -193,7 +193,7 @@ def _rays(settings: Settings, item: Work) -> float:
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, Refinement | None]:
-    """Surfels through what its capture's views see of a scene, then fitted to it, and what that gained.
+    """Make surfels from the visible surfaces of a scene's views, fit them, and return the gain too.
 
     They are judged by the cameras of the first clip, which are not among those.
     """
@@ -216,7 +216,7 @@ def make_surfels(
 
 
 def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Iterator[GBufferView]:
-    """True G-buffers of the views that surfels are made from, a few in memory at a time.
+    """Yield true G-buffers of the views for surfels, a few in memory at a time.
 
     Where an object moves, every other view comes once more with the object away and left out: what it rests
     on has no hole.
@@ -249,7 +249,7 @@ def _pose(spec: SceneSpec, time: float) -> Pose:
 def make_clips(
     spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings: Settings
 ) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
-    """Render one clip a light, in the order of the specification.
+    """Render one clip per light, in the order of the specification.
 
     Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
     both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres. Lights
@@ -501,7 +501,7 @@ def _reference(
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
-    """Return reference members of a frame; behind the scene, irradiance is the environment, as in guidance."""
+    """Return reference members of a frame; behind the scene irradiance is the environment, as in guidance."""
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}

@@ -192,7 +192,7 @@ def _kernels(hand: Hand, gallery: Gallery) -> Iterator[Row]:
 
 @contextmanager
 def _kernel_history(studio: Studio) -> Iterator[Callable[[], set[str]]]:
-    """Return the names of the kernels that the studio launched since the last call."""
+    """Yield a call that returns the kernels that the studio launched in the block."""
 
     def launched() -> set[str]:
         history = _asked(studio, lambda _: dr.kernel_history([dr.KernelType.JIT]))
@@ -207,7 +207,7 @@ def _kernel_history(studio: Studio) -> Iterator[Callable[[], set[str]]]:
 
 
 def _two_clients(hand: Hand, gallery: Gallery) -> Iterator[Row]:
-    """Return the frame count of the slower of two turning views over the faster view's."""
+    """Yield a row: frame count of the slower of two turning views over the faster view's."""
     cameras = hand.home, turned(hand.home, 150)
     for view, camera in enumerate(cameras):
         hand.studio.look(view, camera)
