@@ -34,7 +34,7 @@ class Applications(Benchmark):
         description="arguments of tron-datagen: scenes with true object ids, for selecting and baking"
     )
     data: Path | None = Field(default=None, description="folder of these scenes if they exist already")
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no meshes")
+    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no meshes")
 
     def check(self) -> None:
         """Check that the scenes exist, or the command that makes them."""
@@ -80,7 +80,7 @@ class Applications(Benchmark):
                         measure_motion(self.seed, outcome)
                     case "meshes":
                         if self.real_data is None or not (self.real_data / "assets").is_dir():
-                            log.warning("no assets in benchmark.real_data=%s: no meshes", self.real_data)
+                            log.warning("no meshes: give benchmark.real_data=FOLDER with assets and hdri")
                         else:
                             measure_meshes(self.real_data, self.seed, outcome)
                     case "viewer":

@@ -36,7 +36,9 @@ class Exchange(Benchmark):
         default=None,
         description="Python with bpy, in an environment of its own; null: no mesh, no models",
     )
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no mesh, no models")
+    real_data: Path | None = Field(
+        default=None, description="folder with assets and hdri; null: no mesh, no models"
+    )
     worlds: PositiveInt = Field(
         default=3, description="number of splat scenes, each under another kind of light"
     )

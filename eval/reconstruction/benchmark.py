@@ -99,7 +99,9 @@ class Reconstruction(Benchmark):
     )
     relit: list[Name] = Field(description="ways to relight, besides all ways of the photographs")
     splats: SplatSettings = Field(description="settings of scans of plain splats, used as captures")
-    real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
+    real_data: Path | None = Field(
+        default=None, description="folder with captures/fox and hdri; null: no fox"
+    )
     fox_downscale: PositiveFloat = Field(default=4, description="downsampling factor of the photos")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
     hdris: list[str] = Field(description="files of real_data/hdri that relight the fox")
@@ -304,7 +306,7 @@ class Reconstruction(Benchmark):
         """Reconstruct and relight the fox; None, with a warning, if its photos are missing."""
         data = self.real_data
         if data is None or not (data / "captures" / "fox").is_dir():
-            log.warning("the fox is left out: no captures/fox in benchmark.real_data=%s", data)
+            log.warning("no fox: give benchmark.real_data=FOLDER with captures/fox and hdri")
             return None
         capture, out, cameras = data / "captures" / "fox", folder / "fox", folder / "fox_cameras.json"
         arguments = [f"downscale={self.fox_downscale:g}", *self.fox]

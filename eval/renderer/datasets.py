@@ -66,7 +66,7 @@ class RendererSettings(Benchmark):
         "synthetic_128, models_128_preview, models_512_few_final, captures, shadows",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no models")
+    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no models")
     models: Sizes = Field(description="width of a frame -> recipe of scenes of the models")
     qualities: dict[Quality, Recipe] = Field(
         description="quality of tron-relight -> further arguments for the recipes of models; path_spp "
@@ -122,7 +122,7 @@ class Datasets:
         if name in self.settings.data:
             return self.settings.data[name]
         if data is None or not all((data / kind).is_dir() for kind in ("assets", "hdri")):
-            log.warning("no assets and hdri in %s: no models", data)
+            log.warning("no models: give benchmark.real_data=FOLDER with assets and hdri")
             return None
         recipe = [*self.settings.models[size], *self.settings.qualities[quality]]
         recipe += (self.settings.few_surfels or ()) if few else ()

@@ -35,7 +35,7 @@ class Zoo(Benchmark):
     materials: PositiveInt | None = Field(
         default=None, description="maximum number of materials per shape; null: all"
     )
-    real_data: Path | None = Field(description="folder with hdri; without it maps are drawn")
+    real_data: Path | None = Field(default=None, description="folder with hdri; without it maps are drawn")
     denoisers: bool = Field(default=True, description="measure denoisers and the shipped network too")
     blender_python: Path | None = Field(
         default=None, description="Python with bpy, in an environment of its own; null: no Cycles"
@@ -84,7 +84,10 @@ class Zoo(Benchmark):
         names = [light.name for light in lights]
         outcome.inputs["lights"] = names
         if not photographed(lights):
-            outcome.lack("zoo.ball.rough_error.venice", "no maps in benchmark.real_data: drawn ones light it")
+            outcome.lack(
+                "zoo.ball.rough_error.venice",
+                "drawn maps light it: give benchmark.real_data=FOLDER with hdri",
+            )
         for name in self.lights or []:
             if name not in names:
                 raise TronError(f"no light {name}", "benchmark.lights", f"they are {', '.join(names)}")
