@@ -86,9 +86,7 @@ class Ablations(Benchmark):
     captures: list[str] = Field(description="arguments of tron-datagen that make captures and relight them")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct, the same for every prior")
     priors: dict[Name, list[str]] = Field(description="prior -> further arguments of tron-reconstruct")
-    dataset: list[str] = Field(
-        description="arguments of tron-datagen that make the training data of the fusions"
-    )
+    dataset: list[str] = Field(description="arguments of tron-datagen that make the fusions' training data")
     train: list[str] = Field(description="arguments of tron-train, the same for every fusion")
     fusions: dict[Name, list[str]] = Field(description="fusion -> further arguments of tron-train")
 

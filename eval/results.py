@@ -45,9 +45,7 @@ class Row(BaseModel):
     n: PositiveInt = Field(description="number of averaged items")
     low: FiniteFloat | None = Field(default=None, description="lower end of the interval over scenes")
     high: FiniteFloat | None = Field(default=None, description="upper end of the interval over scenes")
-    scenes: PositiveInt | None = Field(
-        default=None, description="number of independent scenes among the n items"
-    )
+    scenes: PositiveInt | None = Field(default=None, description="number of independent scenes among the n")
     without_one: tuple[FiniteFloat, FiniteFloat] | None = Field(
         default=None, description="least and greatest figure with one scene left out"
     )
@@ -154,9 +152,7 @@ class Results(BaseModel):
     rows: list[Row]
     targets: list[Target] = Field(default_factory=list)
     absent: dict[str, str] = Field(default_factory=dict, description="unmeasured figure -> reason, in words")
-    reproduce: list[str] = Field(
-        default_factory=list, description="command lines that repeat the measurement"
-    )
+    reproduce: list[str] = Field(default_factory=list, description="commands that repeat the measurement")
     series: dict[str, dict[str, list[tuple[FiniteFloat, FiniteFloat]]]] = Field(
         default_factory=dict, description="name of a chart -> label of a line -> (x, y) of its points"
     )

@@ -68,7 +68,7 @@ class Speed(Benchmark):
         description="Mitsuba variants, one process each; null: CPU, and GPU if there is one",
     )
     threads: PositiveInt | None = Field(
-        default=None, description="threads of Dr.Jit and torch; null: one per core"
+        default=None, description="torch and Dr.Jit threads; null: one a core"
     )
     seed: int = 0
     surfels: PositiveInt = Field(default=50_000, description="approximate number of surfels of the scene")
@@ -78,9 +78,7 @@ class Speed(Benchmark):
     network_sizes: list[Annotated[int, Field(ge=8)]] = Field(
         description="width of the frames of networks alone (without making guidance) and of training steps"
     )
-    rounds: PositiveInt = Field(
-        default=5, description="rounds in turns; three rounds of anything over a second"
-    )
+    rounds: PositiveInt = Field(default=5, description="rounds in turns; three if over a second")
 
     def check(self) -> None:
         """Find the checkpoints."""

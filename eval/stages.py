@@ -56,7 +56,7 @@ class StageRecord(BaseModel):
 
     commands: list[list[str]] = Field(description="commands as typed")
     seconds: NonNegativeFloat = Field(
-        default=0.0, description="wall time of all attempts, without nested stages"
+        default=0.0, description="wall time of all attempts without nested stages"
     )
     attempts: int = Field(default=0, ge=0)
     finished: bool = False

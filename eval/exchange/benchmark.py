@@ -27,7 +27,7 @@ class Exchange(Benchmark):
     seed: int = 0
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
     threads: PositiveInt | None = Field(
-        default=None, description="threads of Dr.Jit and Cycles; null: one per core"
+        default=None, description="Cycles and Dr.Jit threads; null: one a core"
     )
     splat_transform: Path | None = Field(
         default=None, description="PlayCanvas's splat-transform; null: the one on PATH, if any"
@@ -37,23 +37,15 @@ class Exchange(Benchmark):
         description="Python with bpy, in an environment of its own; null: no mesh, no models",
     )
     real_data: Path | None = Field(
-        default=None, description="folder with assets and hdri; null: no mesh, no models"
+        default=None, description="folder with assets, hdri; null: no mesh, models"
     )
-    worlds: PositiveInt = Field(
-        default=3, description="number of splat scenes, each under another kind of light"
-    )
+    worlds: PositiveInt = Field(default=3, description="number of splat scenes, each under another light")
     surfels: PositiveInt = Field(default=20_000, description="approximate number of surfels of a splat scene")
-    mesh_surfels: PositiveInt = Field(
-        default=60_000, description="approximate number of surfels of the exported model"
-    )
+    mesh_surfels: PositiveInt = Field(default=60_000, description="approximate surfels of the exported model")
     views: PositiveInt = Field(default=3, description="number of views of the mesh")
     width: PositiveInt = Field(default=256, description="width of the square views of the mesh")
-    paths: PositiveInt = Field(
-        default=144, description="samples per pixel of the mesh, by Cycles and by Mitsuba"
-    )
-    model_paths: PositiveInt = Field(
-        default=1024, description="samples per pixel of a model, by Cycles and by Mitsuba"
-    )
+    paths: PositiveInt = Field(default=144, description="samples per pixel of the mesh, Cycles and Mitsuba")
+    model_paths: PositiveInt = Field(default=1024, description="samples per pixel of a model, each renderer")
     texture: int = Field(default=2048, ge=64, le=8192, description="width of the mesh's textures")
     scans: list[Path] | None = Field(
         default=None, description="plain 3DGS PLYs to view; null: all in real_data/splats"

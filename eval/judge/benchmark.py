@@ -49,9 +49,7 @@ class Judge(Benchmark):
         "methods are sent there"
     )
     model: str | None = Field(description="name of a vision model at this address")
-    key_variable: str = Field(
-        description="environment variable with the API key, which is never written to a file"
-    )
+    key_variable: str = Field(description="environment variable with the API key, never written to a file")
     answers: Path | None = Field(
         description="file of stored answers, which are reused; null: answers.jsonl in output_dir"
     )

@@ -78,13 +78,11 @@ class MeshSettings(BaseModel):
     surface_rate: PositiveFloat = Field(default=0.03, description="learning rate of roughness and metallic")
     light_rate: PositiveFloat = Field(default=0.05, description="learning rate of the logarithm of the light")
     smooth_color: NonNegativeFloat = Field(
-        default=0.02, description="smoothing weight of base color along mesh edges"
+        default=0.02, description="smoothing weight of base color at edges"
     )
-    smooth_surface: NonNegativeFloat = Field(
-        default=0.02, description="smoothing weight of roughness and metallic"
-    )
+    smooth_surface: NonNegativeFloat = Field(default=0.02, description="smoothing of roughness and metallic")
     smooth_light: NonNegativeFloat = Field(
-        default=0.002, description="smoothing weight of the logarithm of the light"
+        default=0.002, description="smoothing weight of the light's logarithm"
     )
     plain: NonNegativeFloat = Field(
         default=0.01, description="weight that pulls metallic to 0 and roughness to its initial value"

@@ -76,9 +76,7 @@ class Surfels(Making):
     quality: Literal["preview", "final"] = Field(description="quality, as in tron-relight")
     count: PositiveInt = Field(description="number of surfels of a scene with surfels=true_maps")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct with surfels=photos")
-    renderer: str = Field(
-        description="weights for the way network: a file, or the name of a shipped checkpoint"
-    )
+    renderer: str = Field(description="weights for the way network: a file, or a shipped checkpoint's name")
 
     def make(self, output_dir: Path) -> list[Path]:
         """Make surfels, lights and frames scene by scene; finished scenes are skipped."""

@@ -104,9 +104,7 @@ class SuiteFile(_Described):
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,39}$")
     id: str = Field(description="id that methods cite")
     tone_curve: ToneCurve
-    background: Literal["black", "environment"] = Field(
-        description="content of the truth where no surface is"
-    )
+    background: Literal["black", "environment"] = Field(description="content of the truth off surfaces")
     source: str = Field(default="", description="command that made the suite")
     scenes: dict[Name, SceneEntry] = Field(min_length=1)
 

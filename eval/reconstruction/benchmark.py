@@ -85,9 +85,7 @@ class Reconstruction(Benchmark):
     seed: int = 0
     parts: list[Part] = Field(description="parts to measure", min_length=1)
     datagen: list[str] = Field(description="arguments of tron-datagen that make the captures")
-    reconstruct: list[str] = Field(
-        description="arguments of tron-reconstruct, the same for every scene and way"
-    )
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for every scene and way")
     ways: dict[Name, list[str]] = Field(
         description="way -> further arguments of tron-reconstruct; the first way is the main one"
     )
@@ -99,9 +97,7 @@ class Reconstruction(Benchmark):
     )
     relit: list[Name] = Field(description="ways to relight, besides all ways of the photographs")
     splats: SplatSettings = Field(description="settings of scans of plain splats, used as captures")
-    real_data: Path | None = Field(
-        default=None, description="folder with captures/fox and hdri; null: no fox"
-    )
+    real_data: Path | None = Field(default=None, description="folder with captures/fox, hdri; null: no fox")
     fox_downscale: PositiveFloat = Field(default=4, description="downsampling factor of the photos")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
     hdris: list[str] = Field(description="files of real_data/hdri that relight the fox")

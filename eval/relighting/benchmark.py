@@ -52,11 +52,9 @@ class Relighting(Benchmark):
         description="data set of another kind (tron-datagen experiment=models): its test split gives rows "
         "that end in .ood, by the same weights and fits",
     )
-    vae: Path | None = Field(
-        default=None, description="file of the WAN 2.1 VAE, if the renderer's codec needs it"
-    )
+    vae: Path | None = Field(default=None, description="file of the WAN 2.1 VAE, if the codec needs it")
     train_splits: list[str] = Field(
-        default=["train"], description="splits for fitting the baselines", min_length=1
+        default=["train"], description="splits for fitting baselines", min_length=1
     )
     fitted_on: DatasetPlace | None = Field(
         default=None,

@@ -88,9 +88,7 @@ class RendererSettings(Benchmark):
         description="arguments of tron-train for per-pixel baselines on the training split of each test "
         "distribution that has one; null: no such baselines",
     )
-    pictures: NonNegativeInt = Field(
-        default=3, description="number of scenes of each distribution on the page"
-    )
+    pictures: NonNegativeInt = Field(default=3, description="number of scenes per distribution on the page")
 
     def weights(self) -> list[Path]:
         """Return the files of the checkpoints."""

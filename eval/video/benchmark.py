@@ -45,15 +45,11 @@ class Video(Benchmark):
 
     name: ClassVar[str] = "video"
 
-    suite: Path | None = Field(
-        description="folder written by tron-eval export=SUITE; null: only the drawn clip"
-    )
+    suite: Path | None = Field(description="folder of tron-eval export=SUITE; null: only the drawn clip")
     methods: Path | list[Path] | None = Field(description="folder of methods' folders, or [a,b]")
     vbench: Path | None = Field(description="Python of an environment with `vbench`; null: no VBench scores")
     vbench_weights: Path = Field(description="VBENCH_CACHE_DIR; missing weights are named, not downloaded")
-    vbench_timeout: PositiveFloat = Field(
-        description="time limit of VBench for all clips of a method, seconds"
-    )
+    vbench_timeout: PositiveFloat = Field(description="time limit of VBench per method, seconds")
     seed: int = Field(default=0, description="seed of the drawn clip's noise, and of the intervals")
 
     def check(self) -> None:

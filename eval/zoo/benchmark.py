@@ -28,13 +28,11 @@ class Zoo(Benchmark):
     seed: int = Field(default=0, description="seed; targets are for 0, other seeds are for development")
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
     threads: PositiveInt | None = Field(
-        default=None, description="threads of Dr.Jit and Cycles; null: one per core"
+        default=None, description="Cycles and Dr.Jit threads; null: one a core"
     )
     shapes: list[Kind] = Field(description="kinds of shapes", min_length=1)
     lights: list[str] | None = Field(default=None, description="names of lights; null: all")
-    materials: PositiveInt | None = Field(
-        default=None, description="maximum number of materials per shape; null: all"
-    )
+    materials: PositiveInt | None = Field(default=None, description="most materials per shape; null: all")
     real_data: Path | None = Field(default=None, description="folder with hdri; without it maps are drawn")
     denoisers: bool = Field(default=True, description="measure denoisers and the shipped network too")
     blender_python: Path | None = Field(
