@@ -334,10 +334,10 @@ def test_a_way_is_of_scenes_or_of_photos(stand_ins: Path, tmp_path: Path, capfd:
 
 @pytest.mark.parametrize("real_data", ["null", "nowhere"])
 def test_without_real_data_the_fox_has_no_rows_and_no_section(
-    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str], real_data: str
+    stand_ins: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, real_data: str
 ):
     assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={real_data}") == 0
-    assert "give benchmark.real_data=FOLDER" in capfd.readouterr().err
+    assert "give benchmark.real_data=FOLDER" in caplog.text
     results = Results.load(tmp_path / "out" / "results.json")
     assert results.rows == []
     assert not stand_ins.exists()
