@@ -65,12 +65,6 @@ class LossSettings(BaseModel):
         "gain nothing. Lower it with data.mend; otherwise frames that are already right "
         "dominate the loss.",
     )
-    sharpness: float = Field(
-        default=0.0,
-        ge=0,
-        description="Weight of what gradients lack of the truth's strength, in windows of 16 x 16 pixels: "
-        "errors of values alone are least where unknown detail is blurred.",
-    )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(
         default=None, description="Local vgg16-397923af.pth; without it LPIPS is absent and the log says so."
