@@ -23,8 +23,8 @@ SIZE = 512
 """Side of each picture, pixels: those of the frames, and a detail enlarged beside them."""
 GAP, LABEL = 4, 16
 ROWS = (
-    ("preview", "test-000001-l1", (150, 150, 160)),
-    ("final", "test-000002-l0", (150, 150, 160)),
+    ("preview", "test-000001-l1", (130, 130, 160)),
+    ("final", "test-000001-l0", (330, 190, 160)),
 )
 """Quality, clip, and the square that is enlarged: left, top, side."""
 

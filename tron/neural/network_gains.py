@@ -22,8 +22,8 @@ NETWORK: Way = "network"
 
 GAINS: Mapping[Way, Mapping[Quality, Mapping[int, float]]] = {
     NETWORK: {
-        "preview": {128: 0.83, 256: 0.60, 512: 0.27},
-        "final": {128: 0.22, 256: 0.29, 512: 0.29},
+        "preview": {128: 0.73, 256: 0.54, 512: 0.36},
+        "final": {128: 0.17, 256: 0.39, 512: 0.43},
     },
     "oidn": {
         "preview": {128: 0.15, 256: 0.02, 512: 0.03},
