@@ -63,21 +63,23 @@ class Carried:
         scene: every surfel of the scan with its own radiance, and with materials.
         proxy: what light sees of it, with the materials of the fit.
         fit: of the proxy.
-        explained: dB between the scan's own look and its picture under the light that was found.
+        explained: dB between the scan's own look and its picture under the light that was found; None where
+            nobody asked.
     """
 
     scene: GaussianScene
     proxy: Proxy
     fit: JointFit
-    explained: float
+    explained: float | None = None
 
     def said(self) -> dict[str, Any]:
         """Plain values for a report."""
-        return {**self.fit.said(), "explained_psnr": round(self.explained, 2)}
+        judged = {} if self.explained is None else {"explained_psnr": round(self.explained, 2)}
+        return self.fit.said() | judged
 
 
 def carry_materials(
-    capture: Capture, settings: JointSettings, seed: int, track: Track = untracked
+    capture: Capture, settings: JointSettings, seed: int, track: Track = untracked, *, judged: bool = False
 ) -> Carried | None:
     """Find materials of a scan and the light it was captured in; None where it shows no surface, with a line.
 
@@ -86,6 +88,8 @@ def carry_materials(
         settings: of the joint fit. A film is exposed alike, and balanced: what they say of that is not asked.
         seed: root of the random numbers.
         track: wraps long loops.
+        judged: whether the scan is drawn under the light that was found, to say how much of it that explains:
+            another 7 % of the time.
 
     Raises:
         TronError: a loss is not finite.
@@ -99,8 +103,11 @@ def carry_materials(
         log.warning("views of the scan agree on no surface, so that its materials cannot be told")
         return None
     scene, proxy, fit = found
+    log.info(described(fit, capture.up))
+    if not judged:
+        return Carried(scene, proxy, fit)
     explained = _explained(scene, proxy, fit, capture, settings.tone_curve or capture.tone_curve, seed)
-    log.info("%s; under it the scan looks as it did to %.1f dB", described(fit, capture.up), explained)
+    log.info("under it the scan looks as it did to %.1f dB", explained)
     return Carried(scene, proxy, fit, explained)
 
 
