@@ -203,7 +203,7 @@ class _Fit:
         self.fine[: sizes[0]] = 0
         self.grey = _single(settings.grey / np.repeat(sizes, sizes))[:, None]
         self.grey[: sizes[0]] *= 0.05
-        self.values = np.zeros((len(self.fine) + 1, 3), np.float32)
+        self.values: np.ndarray = np.zeros((len(self.fine) + 1, 3), np.float32)
         mean = float(self.log_color.mean())
         self.values[: sizes[0], 0] = mean + 1.0  # as bright as the mean point asks for
         first = np.full(3, 0.3 * np.exp(mean)) if begin is None else begin.sun
