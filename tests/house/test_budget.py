@@ -20,7 +20,7 @@ CODE = {
     "tron/meshing": (350, 3),
     "tron/models": (2_210, 13),
     "tron/neural": (2_380, 22),
-    "tron/reconstruction": (6_770, 35),
+    "tron/reconstruction": (6_815, 35),
     "tron/relighting": (1_355, 6),
     "tron/report": (650, 5),
     "tron/scans": (820, 5),
@@ -44,7 +44,7 @@ TESTS = {
     "tests/robustness": 2_500,
     "tests/slurm": 300,
     "tests/train": 3_250,
-    "tests/tron": 33_640,
+    "tests/tron": 33_670,
 }
 """Tests of a package -> their lines."""
 MOST_ROOM = 2_000

@@ -28,3 +28,14 @@ def test_help_of_training_waits_for_no_torch():
     )
     done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
     assert done.stdout.splitlines()[-1] == "loaded set()"
+
+
+def test_a_scan_is_lit_and_its_materials_are_found_without_torch():
+    """Nor by what reads datasets, poses photos or draws plots: a frame waits for no import that it leaves."""
+    used = "tron.apps.relight.command tron.relighting tron.reconstruction.materials.carried"
+    code = f"import sys; {'; '.join(f'import {name}' for name in used.split())}; print(*sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], capture_output=True, text=True, check=True)
+    loaded = set(done.stdout.split())
+    assert "tron.reconstruction.light.fit_pairs" in loaded
+    away = {"torch", "lightning", "diffusers", "torchmetrics", "safetensors", "fsspec", "webdataset"}
+    assert not (away | {"pycolmap", "matplotlib", "pandas", "trimesh", "jinja2", "dask"}) & loaded

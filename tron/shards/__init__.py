@@ -8,14 +8,12 @@ the `index` of a shard, `webdataset` gives them as a pipeline of tensors, `verif
 from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
-from tron.shards.clip_store import ClipStore
-from tron.shards.manifest import Manifest, ShardEntry
-from tron.shards.reader import read_clips, verify
 from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
 
-if (
-    TYPE_CHECKING
-):  # they need webdataset, which who reads clips at random, or knows their members, need not have
+if TYPE_CHECKING:  # tron-relight knows the members and reads no clip; who reads clips may lack webdataset
+    from tron.shards.clip_store import ClipStore
+    from tron.shards.manifest import Manifest, ShardEntry
+    from tron.shards.reader import read_clips, verify
     from tron.shards.streaming import webdataset
     from tron.shards.writer import ShardWriter
 
@@ -35,9 +33,16 @@ __all__ = [
     "webdataset",
 ]
 
+_HOMES = {
+    "ClipStore": "clip_store",
+    **dict.fromkeys(("Manifest", "ShardEntry"), "manifest"),
+    **dict.fromkeys(("read_clips", "verify"), "reader"),
+    "webdataset": "streaming",
+    "ShardWriter": "writer",
+}
+
 
 def __getattr__(name: str) -> Any:
-    homes = {"webdataset": "streaming", "ShardWriter": "writer"}
-    if name not in homes:
+    if name not in _HOMES:
         raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{homes[name]}"), name)
+    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)

@@ -21,6 +21,7 @@ from tron.errors import TronError
 from tron.gaussians import GaussianScene
 from tron.reconstruction.geometry.losses import photometric_loss
 from tron.reconstruction.light.surface_points import PointBatch, SurfacePoints, surface_mask
+from tron.reconstruction.light.surfel_colors import reduced
 from tron.reconstruction.progress import Track, untracked
 from tron.reconstruction.settings import FitSettings
 from tron.runtime import aligned
@@ -359,15 +360,6 @@ def surface_mask_of(photo: Photo) -> np.ndarray:
     """(H, W) float32 of the original view: 1 where its masks leave a surface."""
     camera = photo.view.camera
     return surface_mask(photo.view, np.ones((camera.height, camera.width), np.float32)).astype(np.float32)
-
-
-def reduced(image: np.ndarray, factor: int) -> np.ndarray:
-    """Means of ``factor`` x ``factor`` pixels; what is left over at the right and the bottom is dropped."""
-    if factor == 1:
-        return image
-    height, width = (n // factor for n in image.shape[:2])
-    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
-    return np.ascontiguousarray(blocks.mean((1, 3)).reshape(height, width, *image.shape[2:]))
 
 
 def reduced_camera(camera: Camera, factor: int) -> Camera:

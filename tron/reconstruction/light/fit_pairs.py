@@ -28,17 +28,14 @@ import math
 from dataclasses import dataclass
 
 import numpy as np
-import torch
 from pydantic import Field
 from scipy.sparse import csr_array
 from scipy.spatial import KDTree
-from torch import Tensor
 
 from tron.captures.view import FLOOR
 from tron.errors import TronError
 from tron.reconstruction.light.sky_visibility import PhotographedSky, cube_texels
 from tron.reconstruction.settings import Settings
-from tron.runtime import torch_device
 from tron.seeds import generator
 
 _NEARBY, _SIMILAR = 60, 200
@@ -61,6 +58,13 @@ _FACING = 0.6  # least cosine between normals of one patch
 _WARM = (0.5, -0.87)
 """Unit direction of black bodies of 3,000 to 15,000 K in log R / G and log B / G, linear BT.709."""
 _OFF_WARM = 3.0  # how much more a colour away from their line costs: light is warm or cool, rarely green
+_ACROSS = np.array([-_WARM[1], _WARM[0]])
+_OFF_GREY = (0.5 * np.eye(2) + 0.5 * (_OFF_WARM**2 - 1) * np.outer(_ACROSS, _ACROSS)).astype(np.float32)
+"""(2, 2) quadratic form of log R / G and log B / G: what a colour costs."""
+_TO_LOG_RGB = np.array([[1, 1, 1], [1, 0, 0], [0, 0, 1]], np.float32)
+"""From rows of log luminance, log R / G and log B / G."""
+_LEAST = 1e-5  # irradiance / pi that is divided by
+_FORGET = 0.9, 0.999  # of Adam's moments, Kingma and Ba 2015
 
 
 class TooFewSeen(TronError):
@@ -172,6 +176,12 @@ def fit_light(
 
 
 class _Fit:
+    """Adam with derivatives by hand: the problem is small, and autograd was most of a step.
+
+    Unknowns are rows of three: of each texel of each level log luminance and the chromas log R / G and
+    log B / G; the last row is the log of the sun, (R, G, B). Arrays are float32.
+    """
+
     def __init__(
         self,
         points: Points,
@@ -180,34 +190,28 @@ class _Fit:
         sky: PhotographedSky | None,
         begin: Light | None,
     ) -> None:
-        device = torch_device()
-
-        def tensor(values: np.ndarray) -> Tensor:
-            return torch.tensor(np.ascontiguousarray(values), dtype=torch.float32, device=device)
-
-        self.settings, self.seed, self.tensor = settings, seed, tensor
-        self.transport, self.bounced = tensor(points.transport), tensor(points.bounced)
-        self.log_color = tensor(np.log(np.maximum(points.color, FLOOR)))
-        self.lobe = None if points.lobe is None else tensor(points.lobe)[:, None]
+        self.settings, self.seed = settings, seed
+        self.transport, self.bounced = _single(points.transport), _single(points.bounced)
+        self.log_color = _single(np.log(np.maximum(points.color, FLOOR)))
+        self.lobe = None if points.lobe is None else _single(points.lobe)[:, None]
         finest = settings.resolution
         levels = [m for m in (1, 2, 4, 8, 16) if m < finest] + [finest]
-        self.ups = [tensor(_spread(finest, m)) for m in levels[:-1]]
+        texels = 6 * finest * finest
+        self.levels = _single(np.concatenate([*(_spread(finest, m) for m in levels[:-1]), np.eye(texels)], 1))
         sizes = [6 * m * m for m in levels]
-        self.grey = [torch.zeros(n, 1, device=device, requires_grad=True) for n in sizes]
-        self.chroma = [torch.zeros(n, 2, device=device, requires_grad=True) for n in sizes]
-        with torch.no_grad():  # as bright as the mean point asks for
-            self.grey[0] += float(self.log_color.mean()) + 1.0
-        first = (
-            np.full(3, 0.3 * float(np.exp(self.log_color.mean().cpu().numpy())))
-            if begin is None
-            else begin.sun
-        )
-        self.sun = tensor(np.log(np.maximum(first, 1e-6))).requires_grad_(True)
-        groups = [
-            {"params": [*self.grey, self.sun], "lr": _RATE},
-            {"params": self.chroma, "lr": 0.4 * _RATE},
-        ]
-        self.adam = torch.optim.Adam(groups)
+        self.fine = _single(np.repeat([_SMOOTH * 2.0**k / n for k, n in enumerate(sizes, -1)], sizes))
+        self.fine[: sizes[0]] = 0
+        self.grey = _single(settings.grey / np.repeat(sizes, sizes))[:, None]
+        self.grey[: sizes[0]] *= 0.05
+        self.values: np.ndarray = np.zeros((len(self.fine) + 1, 3), np.float32)
+        mean = float(self.log_color.mean())
+        self.values[: sizes[0], 0] = mean + 1.0  # as bright as the mean point asks for
+        first = np.full(3, 0.3 * np.exp(mean)) if begin is None else begin.sun
+        self.values[-1] = np.log(np.maximum(first, 1e-6))
+        self.rates = np.full_like(self.values, _RATE)
+        self.rates[:-1, 1:] *= 0.4
+        self.moments = np.zeros((2, *self.values.shape), np.float32)
+        self.count = 0
         size = np.ptp(points.position, axis=0).max()
         place = np.concatenate([points.position / size, _TURN * points.normal], 1)
         self.near = np.asarray(KDTree(place).query(place, k=min(_NEARBY, len(place)))[1])
@@ -216,29 +220,29 @@ class _Fit:
         # How much of the points' light could come from a direction, against an open sphere of points: 1/4.
         _, solid = cube_texels(settings.resolution)
         share = points.transport.mean(0) / (solid / np.pi)
-        self.unseen = tensor(np.exp(-share / 0.02))
+        self.unseen = _single(np.exp(-share / 0.02))
         self.sky = None
         if sky is not None and sky.trust.any():
-            self.sky = tensor(np.log(np.maximum(sky.radiance, FLOOR))), tensor(sky.trust)
+            self.sky = _single(np.log(np.maximum(sky.radiance, FLOOR))), _single(sky.trust)[:, None]
         self.loss = float("nan")
 
-    def log_light(self) -> Tensor:
+    def log_light(self) -> np.ndarray:
         """(D, 3) log radiance."""
-        grey, chroma = (_composed(levels, self.ups) for levels in (self.grey, self.chroma))
-        return torch.cat([grey + chroma[:, :1], grey, grey + chroma[:, 1:]], 1)
+        return self.levels @ (self.values[:-1] @ _TO_LOG_RGB)
 
-    def log_base_color(self) -> Tensor:
-        """(P, 3) of the current light."""
-        received = self.transport @ torch.exp(self.log_light()) + self.bounced
-        if self.lobe is not None:
-            received = received + self.lobe * torch.exp(self.sun)
-        return self.log_color - torch.log(received.clamp(min=1e-5))
+    def received(self) -> np.ndarray:
+        """(P, 3) irradiance / pi under the current light."""
+        received = self.transport @ np.exp(self.log_light()) + self.bounced
+        return received if self.lobe is None else received + self.lobe * np.exp(self.values[-1])
+
+    def log_base_color(self, received: np.ndarray) -> np.ndarray:
+        """(P, 3) of points that receive that."""
+        return self.log_color - np.log(np.maximum(received, _LEAST))
 
     def draw_pairs(self, number: int) -> None:
         """Draw partners of all points by the current base color."""
         draw = generator(self.seed, "joint light", "pairs", number)
-        with torch.no_grad():
-            base = self.log_base_color().cpu().numpy()
+        base = self.log_base_color(self.received())
         chroma = base[:, [0, 2]] - base[:, 1:2]
         count = len(base)
         alike = np.asarray(KDTree(chroma).query(chroma, k=min(_SIMILAR, count))[1])
@@ -247,54 +251,70 @@ class _Fit:
         i, j = np.tile(i, 2), np.concatenate(partners)
         weight = np.repeat([1.0, 0.5], len(i) // 2) * (self.rare[i] + self.rare[j])
         weight *= np.exp(-(((chroma[i] - chroma[j]) / ALIKE) ** 2).sum(1))
-        # By point: the first of a pair then needs no gather, whose adjoint is the slowest part of a step.
-        shape = (2, count, _PARTNERS)
-        j, weight = (np.moveaxis(values.reshape(shape), 0, 1).reshape(count, -1) for values in (j, weight))
-        self.partner = torch.from_numpy(j.ravel()).to(self.log_color.device)
-        self.weight = self.tensor(weight / weight.sum())[..., None] / 3
+        self.weight = _single(weight / weight.sum())[:, None] / 3
+        signs = np.tile(np.array([1, -1], np.float32), len(i))
+        both = np.stack([i, j], 1).ravel(), np.arange(0, 2 * len(i) + 1, 2)
+        self.apart = csr_array((signs, *both), shape=(len(i), count))  # the first's value less the second's
+        self.together = self.apart.T.tocsr()
 
     def step(self) -> None:
         """Take one step of Adam."""
-        light, base = self.log_light(), self.log_base_color()
-        off = (base[:, None] - base.index_select(0, self.partner).view(*self.weight.shape[:2], 3)).abs()
-        loss = (self.weight * ROBUST * torch.log1p(off / ROBUST)).sum()
-        loss = loss + _SMOOTH * sum((z**2).mean() * 2.0**k for k, z in enumerate(self.grey[1:]))
-        loss = loss + self.settings.grey * sum(_coloured(z) for z in self.chroma[1:])
-        loss = loss + self.settings.grey * 0.05 * _coloured(self.chroma[0])
-        bright = torch.quantile(base.amax(1), _PERCENTILE / 100)
-        loss = loss + self.settings.scale * (bright - float(np.log(self.settings.brightest))) ** 2
-        brightness = light.mean(1)
-        mean = torch.log(torch.exp(brightness).mean()).detach()
-        above = (brightness - mean - float(np.log(_DARKNESS))) ** 2
-        loss = loss + _DARK * (self.unseen * above).mean()
-        if self.sky is not None:
-            shown, trust = self.sky
-            loss = loss + _SKY * (trust[:, None] * torch.log1p((light - shown).abs())).mean()
-        self.adam.zero_grad()
-        loss.backward()
-        self.loss = float(loss.detach())
+        self.loss, gradient = self.misfit()
         if not np.isfinite(self.loss):
             raise TronError(f"the loss of the light is {self.loss}")
-        self.adam.step()
+        self.count += 1
+        for moment, power, forget in zip(self.moments, (gradient, gradient**2), _FORGET):
+            moment += (1 - forget) * (power - moment)
+        mean, square = (each / (1 - forget**self.count) for each, forget in zip(self.moments, _FORGET))
+        self.values -= self.rates * mean / (np.sqrt(square) + 1e-8)
+
+    def misfit(self) -> tuple[float, np.ndarray]:
+        """The loss, and its derivatives by the unknowns."""
+        light, received = self.log_light(), self.received()
+        base = self.log_base_color(received)
+        off = self.apart @ base
+        far = 1 + np.abs(off) / ROBUST
+        loss = float((self.weight * ROBUST * np.log(far)).sum())
+        by_base = self.together @ (self.weight * np.sign(off) / far)
+
+        brightest = base.max(1)
+        place = _PERCENTILE / 100 * (len(base) - 1)
+        lower = min(int(place), len(base) - 2)
+        ranked = np.argpartition(brightest, (lower, lower + 1))[lower : lower + 2]
+        shares = np.array([lower + 1 - place, place - lower], np.float32)
+        above = float(shares @ brightest[ranked]) - float(np.log(self.settings.brightest))
+        loss += self.settings.scale * above**2
+        by_base[ranked, base[ranked].argmax(1)] += 2 * self.settings.scale * above * shares
+        by_received = np.where(received > _LEAST, -by_base / np.maximum(received, _LEAST), 0)
+
+        by_light = np.exp(light) * (self.transport.T @ by_received)
+        brightness = light.mean(1)
+        bright = brightness - np.log(np.exp(brightness).mean()) - np.float32(np.log(_DARKNESS))
+        loss += _DARK * float((self.unseen * bright**2).mean())
+        by_light += (2 * _DARK / 3 / len(light) * self.unseen * bright)[:, None]  # of a mean that is held
+        if self.sky is not None:
+            shown, trust = self.sky
+            far = 1 + np.abs(light - shown)
+            loss += _SKY * float((trust * np.log(far)).mean())
+            by_light += _SKY / light.size * trust * np.sign(light - shown) / far
+
+        gradient, levels = np.zeros_like(self.values), self.values[:-1]
+        gradient[:-1] = (self.levels.T @ by_light) @ _TO_LOG_RGB.T
+        coloured = self.grey * (levels[:, 1:] @ _OFF_GREY)
+        loss += float((self.fine * levels[:, 0] ** 2).sum() + (coloured * levels[:, 1:]).sum())
+        gradient[:-1, 0] += 2 * self.fine * levels[:, 0]
+        gradient[:-1, 1:] += 2 * coloured
+        if self.lobe is not None:
+            gradient[-1] = (self.lobe * by_received).sum(0) * np.exp(self.values[-1])
+        return loss, gradient
 
     def result(self) -> Light:
-        with torch.no_grad():
-            texels = torch.exp(self.log_light()).cpu().numpy()
-            sun = torch.exp(self.sun).cpu().numpy() if self.lobe is not None else np.zeros(3, np.float32)
-        return Light(texels, sun, self.loss)
+        sun = np.zeros(3, np.float32) if self.lobe is None else np.exp(self.values[-1])
+        return Light(np.exp(self.log_light()), sun, self.loss)
 
 
-def _coloured(chroma: Tensor) -> Tensor:
-    """Mean square of log colours (N, 2), those off the line of black bodies counted more."""
-    off = chroma @ chroma.new_tensor([-_WARM[1], _WARM[0]])
-    return (chroma**2).mean() + 0.5 * (_OFF_WARM**2 - 1) * (off**2).mean()
-
-
-def _composed(levels: list[Tensor], ups: list[Tensor]) -> Tensor:
-    total = levels[-1]
-    for up, level in zip(ups, levels[:-1], strict=True):
-        total = total + up @ level
-    return total
+def _single(values: np.ndarray) -> np.ndarray:
+    return np.ascontiguousarray(values, np.float32)
 
 
 def _spread(fine: int, coarse: int) -> np.ndarray:

@@ -19,7 +19,6 @@ from scipy.spatial import KDTree
 from tron.captures import View
 from tron.captures.view import CLIPPED, FLOOR, ToneCurve, linear_light
 from tron.reconstruction.geometry.seen_space import OPAQUE
-from tron.reconstruction.light.fit_environment import reduced
 from tron.reconstruction.progress import Track, untracked
 from tron.shading.guidance import ViewTracer
 
@@ -207,6 +206,15 @@ def observe(
         len(scene),
         len(views),
     )
+
+
+def reduced(image: np.ndarray, factor: int) -> np.ndarray:
+    """Means of ``factor`` x ``factor`` pixels; what is left over at the right and the bottom is dropped."""
+    if factor == 1:
+        return image
+    height, width = (n // factor for n in image.shape[:2])
+    blocks = image[: height * factor, : width * factor].reshape(height, factor, width, factor, -1)
+    return np.ascontiguousarray(blocks.mean((1, 3)).reshape(height, width, *image.shape[2:]))
 
 
 def bilinear(image: np.ndarray, place: np.ndarray) -> np.ndarray:

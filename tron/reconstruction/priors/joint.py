@@ -23,7 +23,7 @@ class Joint(JointSettings, Prior):
 
     def carry(self, capture: Capture, seed: int, track: Track) -> Carried | None:
         """See :func:`carry_materials`."""
-        return carry_materials(capture, self, seed, track)
+        return carry_materials(capture, self, seed, track, judged=True)
 
     def find_materials(self, surfels: Surfels) -> Materials:
         """Find light and materials together, on a proxy of the surfels; where there is none, on themselves.

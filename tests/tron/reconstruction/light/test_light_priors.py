@@ -158,3 +158,30 @@ def test_few_points_that_face_a_way_count_as_much_as_many(variant: str) -> None:
         }
     )
     assert error(fit_light(mixed, SETTINGS, 0), whole, truth) < 0.03
+
+
+def test_derivatives_are_those_of_the_loss(variant: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """By finite differences in float64, of all unknowns, the sun's too, and of each part of the loss.
+
+    But of the dark prior, whose mean is held; what it does is seen above.
+    """
+    monkeypatch.setattr(fit_pairs, "_single", lambda values: np.ascontiguousarray(values, np.float64))
+    monkeypatch.setattr(fit_pairs, "_DARK", 0.0)
+    draw = generator(3, "tests", "derivatives")
+    points = replace(points_under(lamp(), patches(), bounced=0.1), lobe=draw.uniform(0, 1, COUNT))
+    sky = PhotographedSky(1.5 * lamp(), draw.uniform(0, 1, len(lamp())))
+    settings = SETTINGS.model_copy(update={"scale": 1.0, "grey": 1.0})
+    fit = fit_pairs._Fit(points, settings, 0, sky, None)
+    begin = fit.values + draw.normal(0, 0.3, fit.values.shape)
+    fit.values = begin
+    fit.draw_pairs(0)
+    _, gradient = fit.misfit()
+    step = 1e-6
+    for row, column in [(0, 0), (7, 1), (60, 2), (len(begin) - 2, 0), (len(begin) - 1, 1)]:
+        losses = []
+        for sign in (1, -1):
+            fit.values = begin.copy()
+            fit.values[row, column] += sign * step
+            losses.append(fit.misfit()[0])
+        numeric = (losses[0] - losses[1]) / (2 * step)
+        assert gradient[row, column] == pytest.approx(numeric, rel=1e-4, abs=1e-8)

@@ -179,7 +179,7 @@ def small_film() -> Iterator[None]:
 def scanned(small_film: None, painted: GaussianScene, lit: GaussianScene) -> Scanned:
     scan = layered(lit)
     capture = film_of_scan(scan, film_around(scan, 32, 96))
-    found = carry_materials(capture, JointSettings(), 0)
+    found = carry_materials(capture, JointSettings(), 0, judged=True)
     assert found is not None
     return Scanned(capture, np.tile(painted.base_color, (LAYERS, 1)), found)
 
