@@ -143,6 +143,8 @@ cli = command(
     "conf.eval",
     Settings,
     main,
+    shown=("output_dir", "dataset", "renderer", "suite", "methods", "report", "threads", "seed"),
+    listed="benchmark",
     examples=(
         "tron-eval benchmark=demo output_dir=outputs/demo",
         "tron-eval report=docs/benchmarks/tracing",

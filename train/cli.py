@@ -24,6 +24,20 @@ cli = command(
     "conf.train",
     Settings,
     main,
+    shown=(
+        *(
+            "dataset",
+            "output_dir",
+            "max_seconds",
+            "stages",
+            "batch_size",
+            "optimizer.learning_rate",
+            "precision",
+            "devices",
+            "seed",
+        ),
+        *("resume"),
+    ),
     examples=(
         "tron-train experiment=demo dataset=outputs/demo/dataset output_dir=outputs/demo/renderer",
         "tron-train renderer=pixel_mlp max_seconds=300 dataset=DIR output_dir=outputs/pixel_mlp",

@@ -16,11 +16,10 @@ from pydantic import (
     model_validator,
 )
 
-from datagen.settings import SettingsModel
+from datagen.settings import Family, LightChoice, SettingsModel
 from datagen.settings.captures import CapturedSettings, CaptureSettings, PseudoCaptureSettings
 from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSources
 from datagen.settings.surfels import AUTO, Auto, SurfelBudget, surfels_by_pixels
-from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves

@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tron.apps.reconstruct.command import cli as reconstruct
-from tron.apps.relight.command import cli as relight
+from tron.apps.reconstruct.cli import cli as reconstruct
+from tron.apps.relight.cli import cli as relight
 from tron.cameras import Camera
 from tron.captures import load_capture
 from tron.captures.load import FORMATS

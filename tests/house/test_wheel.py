@@ -145,7 +145,7 @@ def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
 def test_a_module_run_beside_a_foreign_conf_says_so_too(installed: Path, tmp_path: Path):
     """`python -m` puts the current folder first on the path."""
     (tmp_path / "conf.py").touch()
-    refused = start(installed, "python", "-m", "tron.apps.relight.command", "--help", cwd=tmp_path)
+    refused = start(installed, "python", "-m", "tron.apps.relight.cli", "--help", cwd=tmp_path)
     assert refused.returncode == 2
     (line,) = refused.stderr.splitlines()
     assert line.startswith("tron-relight: this file hides TRON's own package 'conf'")

@@ -5,17 +5,15 @@ them, `reader` opens them again without ever unpickling anything, `clip_store` r
 the `index` of a shard, `webdataset` gives them as a pipeline of tensors, `verify` finds damage.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from tron.shards.clip_store import ClipStore
-from tron.shards.manifest import Manifest, ShardEntry
-from tron.shards.reader import read_clips, verify
-from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
+from tron.lazily import lazily
 
-if (
-    TYPE_CHECKING
-):  # they need webdataset, which who reads clips at random, or knows their members, need not have
+if TYPE_CHECKING:
+    from tron.shards.clip_store import ClipStore
+    from tron.shards.manifest import Manifest, ShardEntry
+    from tron.shards.reader import read_clips, verify
+    from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
     from tron.shards.streaming import webdataset
     from tron.shards.writer import ShardWriter
 
@@ -35,9 +33,14 @@ __all__ = [
     "webdataset",
 ]
 
-
-def __getattr__(name: str) -> Any:
-    homes = {"webdataset": "streaming", "ShardWriter": "writer"}
-    if name not in homes:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{homes[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "clip_store": "ClipStore",
+        "manifest": "Manifest ShardEntry",
+        "writer": "ShardWriter",
+        "reader": "read_clips verify",
+        "streaming": "webdataset",
+        "schema": "GUIDANCE MEMBERS SCHEMA_VERSION Clip ClipMeta clip_members",
+    },
+)

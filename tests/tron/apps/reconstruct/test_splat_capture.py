@@ -9,7 +9,7 @@ import numpy as np
 import plyfile
 import pytest
 
-from tron.apps.reconstruct.command import cli
+from tron.apps.reconstruct.cli import cli
 from tron.apps.reconstruct.splat_capture import (
     SplatSettings,
     film_splats,
