@@ -55,18 +55,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "output_dir",
-            "mode",
-            "workers",
-            "train.scenes",
-            "test.scenes",
-            "train.frames",
-            "train.width",
-            "train.path_spp",
-            "assets",
-        ),
-        *("environments"),
+        *("output_dir", "mode", "workers", "train.scenes", "test.scenes", "train.frames"),
+        *("train.width", "train.path_spp", "assets", "environments"),
     ),
     examples=(
         "tron-datagen experiment=demo output_dir=outputs/dataset",

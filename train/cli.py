@@ -25,18 +25,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "dataset",
-            "output_dir",
-            "max_seconds",
-            "stages",
-            "batch_size",
-            "optimizer.learning_rate",
-            "precision",
-            "devices",
-            "seed",
-        ),
-        *("resume"),
+        *("dataset", "output_dir", "max_seconds", "stages", "splits", "data.cache_gb"),
+        *("optimizer.learning_rate", "precision", "devices", "start_from"),
     ),
     examples=(
         "tron-train experiment=demo dataset=outputs/demo/dataset output_dir=outputs/demo/renderer",

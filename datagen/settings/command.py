@@ -179,12 +179,14 @@ class Settings(ScaleSettings):
     captured: CapturedSettings = Field(
         default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
     )
+    # Those with words of registries are not checked, which would import these.
     train: SplitSettings = Field(SplitSettings(scenes=16), description="First training split.")
     train_b: SplitSettings = Field(
-        SplitSettings(scenes=4, style="object"), description="Second training split, of another distribution."
+        SplitSettings.model_construct(scenes=4, style="object"),
+        description="Second training split, of another distribution.",
     )
     validation: SplitSettings = Field(
-        SplitSettings(scenes=2, lights=["any"] * 2),
+        SplitSettings.model_construct(scenes=2, lights=["any"] * 2),
         description="Scenes for the PSNR shown during training; networks are not trained on them.",
     )
     test: SplitSettings = Field(

@@ -115,18 +115,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "scene",
-            "environment",
-            "output",
-            "rotation",
-            "exposure",
-            "look",
-            "surroundings",
-            "proxy",
-            "up",
-            "materials",
-        ),
+        *("scene", "environment", "output", "rotation", "exposure", "look", "surroundings"),
+        *("proxy", "up", "materials"),
     ),
     examples=(
         "tron-bake scene=surfels.ply environment=studio.hdr output=relit.ply",

@@ -131,18 +131,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "scene",
-            "environments",
-            "light",
-            "models",
-            "output_dir",
-            "host",
-            "port",
-            "ground",
-            "materials",
-            "up",
-        ),
+        *("scene", "environments", "light", "models", "output_dir", "host", "port", "ground"),
+        *("materials", "up"),
     ),
     examples=(
         "tron-view scene=surfels.ply environments=hdris",

@@ -186,7 +186,7 @@ reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.cli", ("t
 datagen = ConsoleScript(
     "tron-datagen",
     "datagen.cli",
-    ("tron.reconstruction.priors", "datagen.world.lights", "datagen.world.styles"),
+    ("tron.reconstruction.priors", "datagen.world.scene"),
 )
 train = ConsoleScript("tron-train", "train.cli")
 evaluate = ConsoleScript("tron-eval", "eval.cli")

@@ -28,17 +28,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "capture",
-            "output_dir",
-            "max_side",
-            "downscale",
-            "test_every",
-            "masks",
-            "steps_scaler",
-            "splats.geometry",
-        ),
-        *("lpips_weights", "overwrite"),
+        *("capture", "output_dir", "max_side", "downscale", "test_every", "masks"),
+        *("steps_scaler", "splats.geometry", "lpips_weights", "overwrite"),
     ),
     examples=(
         "tron-reconstruct capture=photos output_dir=outputs/mine",

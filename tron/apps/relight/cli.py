@@ -28,18 +28,8 @@ cli = command(
     Settings,
     main,
     shown=(
-        *(
-            "scene",
-            "environment",
-            "output_dir",
-            "quality",
-            "trajectory",
-            "frames",
-            "width",
-            "rotation",
-            "background",
-            "checkpoint",
-        ),
+        *("scene", "environment", "output_dir", "quality", "trajectory", "frames", "width"),
+        *("rotation", "background", "checkpoint"),
     ),
     examples=(
         "tron-relight scene=surfels.ply environment=studio.hdr output_dir=outputs/relit",
