@@ -88,7 +88,7 @@ def main(settings: Settings) -> int:
     benchmark = make(settings.benchmark, "benchmark")
     for name in ("dataset", "renderer", "pixel_mlp", "suite", "methods"):
         if getattr(settings, name) is not None and name not in type(benchmark).model_fields:
-            mend = f"leave it out; tron-eval benchmark={benchmark.name} --help lists what it takes"
+            mend = f"leave it out; tron-eval benchmark={benchmark.name} --help all lists what it takes"
             raise TronError(f"benchmark={benchmark.name} takes no {name}", mend=mend)
     benchmark.check()
     with locked(settings.output_dir):

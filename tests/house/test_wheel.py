@@ -194,7 +194,7 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
-    shown = start(smallest, command, "--help", cwd=tmp_path)
+    shown = start(smallest, command, "--help", "all", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     installed = command in (
         "tron-relight",

@@ -143,7 +143,7 @@ def command(
     Args:
         name: the command as typed, such as `tron-datagen`; every error line starts with it.
         config_module: importable package with `config.yaml` and groups beside it, such as `conf.datagen`.
-        settings: pydantic model of the whole configuration, `extra="forbid"`; `--help` tells its descriptions.
+        settings: pydantic model of the whole configuration, `extra="forbid"`; help tells its descriptions.
         main: does the work; its docstring is what `--help` says the command does. It may return an exit code.
         examples: command lines for `--help all`; the first three are those of `--help`.
         ended: what is left after an interruption, said behind it; "": nothing.
