@@ -1,1 +1,1 @@
-"""The curriculum (tron-train): guidance and pictures from shards in, a neural renderer's weights out."""
+"""The curriculum (tron-train): trains a neural renderer on guidance and pictures read from shards."""

@@ -27,16 +27,16 @@ SMOOTHING = 0.98
 
 
 class TrainingLog(Callback):
-    """Shows loss and validation PSNR on a bar (plain lines where there is no terminal) and in metrics.csv.
+    """Shows loss and validation PSNR on a bar (without a terminal: plain lines) and in metrics.csv.
 
     metrics.csv has one row every `every` steps and at every checkpoint: stage, step, seconds of this stage,
-    smoothed loss (as trained: squared error of values in [-1, 1], plus LPIPS if on), learning rate, how many
-    of the stage's samples so far stood in for damaged ones, and the latest validation's PSNR in dB. Loggers
-    get the same numbers. A resumed run goes on behind the rows it had reached.
+    smoothed training loss (squared error of values in [-1, 1], plus LPIPS if on), learning rate, how many of
+    the stage's samples so far replaced damaged ones, and the latest validation's PSNR in dB. Loggers get the
+    same numbers. A resumed run continues after the rows up to its checkpoint.
 
     Args:
-        path: of metrics.csv. stage: that is trained. clock: its progress. damage: its count.
-        every: steps between rows. first_step: of the stage, where an earlier session left it.
+        path: metrics.csv. stage: the one being trained. clock: its progress. damage: its count.
+        every: steps between rows. first_step: first step of this session within the stage.
     """
 
     columns: tuple[str, ...] = (
@@ -83,10 +83,10 @@ class TrainingLog(Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Note the loss of a step."""
+        """Record the loss of a step."""
         del pl_module, batch, batch_idx
         step = trainer.global_step
-        # Reading a number from a GPU waits for it, and from other processes too: there not at every step.
+        # Reading a number from a GPU or from other processes waits for them, so not at every step.
         if outputs["loss"].device.type == "cpu" or step % 10 == 0 or self.loss != self.loss:
             loss = trainer.strategy.reduce(outputs["loss"].detach(), reduce_op="mean").item()
             self.loss = loss if self.loss != self.loss else SMOOTHING * self.loss + (1 - SMOOTHING) * loss
@@ -97,7 +97,7 @@ class TrainingLog(Callback):
         self._show(trainer)
 
     def on_validation_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Note the PSNR of a validation."""
+        """Record the PSNR of a validation."""
         del pl_module
         named = trainer.callback_metrics
         self.validated = {name: named[name].item() for name in ("val_psnr", "val_psnr_full") if name in named}
@@ -115,7 +115,7 @@ class TrainingLog(Callback):
     def on_exception(
         self, trainer: lightning.Trainer, pl_module: lightning.LightningModule, exception: BaseException
     ) -> None:
-        """Leave the terminal in order."""
+        """Restore the terminal."""
         del trainer, pl_module, exception
         self._close()
 
@@ -129,15 +129,15 @@ class TrainingLog(Callback):
             self._write()
 
     def state_dict(self) -> dict[str, Any]:
-        """The running mean goes into checkpoints."""
+        """Save the running mean of the loss."""
         return {"loss": self.loss}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """The running mean goes on from a checkpoint."""
+        """Restore the running mean of the loss."""
         self.loss = state_dict["loss"]
 
     def _note(self, trainer: lightning.Trainer) -> None:
-        """Add the row of this step, or bring it up to date."""
+        """Add the row of this step, or update it."""
         row = self._row(trainer)
         numbers = {key: float(value) for key, value in row.items() if key not in ("stage", "step", "seconds")}
         for logger in trainer.loggers:
@@ -186,7 +186,7 @@ def steps_before(rows: list[dict[str, Any]], stage: str) -> int:
 
 
 def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]]:
-    """Rows of metrics.csv up to a step of a stage: those of earlier stages, and of this one up to there."""
+    """Rows of metrics.csv up to a step of a stage, with all rows of earlier stages."""
     if not path.is_file():
         return []
     kept: list[dict[str, Any]] = []
@@ -199,16 +199,16 @@ def earlier_rows(path: Path, stage: str, first_step: int) -> list[dict[str, Any]
 
 
 FEWEST = 1000
-"""Samples that a share is taken of at least: of the first few, one damaged sample would be too many."""
+"""Fewest samples that the damaged share is taken of; of the first few, one would exceed any limit."""
 
 
 class DamageCount(Callback):
-    """Number of a stage's samples, in all processes, that stand in for damaged ones; part of checkpoints.
+    """Counts the samples of a stage, over all processes, that replace damaged ones; saved in checkpoints.
 
     Args:
-        stage: that is trained.
+        stage: the stage being trained.
         limit: share of its samples beyond which TronError ends the run, in all processes at once.
-        checkpoint_every: steps between checkpoints, which have the number up to their step.
+        checkpoint_every: steps between checkpoints, each with the count up to its step.
     """
 
     def __init__(self, stage: Stage, limit: float, checkpoint_every: int):
@@ -224,7 +224,7 @@ class DamageCount(Callback):
         batch: dict[str, Tensor],
         batch_idx: int,
     ) -> None:
-        """Count a batch's."""
+        """Add a batch's damaged samples."""
         del pl_module, outputs, batch_idx
         new = batch[DAMAGED]
         self._new = new if self._new is None else self._new + new
@@ -234,17 +234,17 @@ class DamageCount(Callback):
             self._collect(trainer)
 
     def on_train_end(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Count the last ones."""
+        """Add those of the last steps."""
         del pl_module
         if self._new is not None:
             self._collect(trainer)
 
     def state_dict(self) -> dict[str, Any]:
-        """The number goes into checkpoints."""
+        """Save the count."""
         return {"total": self.total}
 
     def load_state_dict(self, state_dict: dict[str, Any]) -> None:
-        """The number goes on from a checkpoint."""
+        """Restore the count."""
         self.total = state_dict["total"]
 
     def _collect(self, trainer: lightning.Trainer) -> None:
@@ -266,7 +266,7 @@ LINE = "stopping behind the step in hand, with a checkpoint; once more after fiv
 
 
 class Stopped(SystemExit):
-    """End of training behind a step and its checkpoint, since SIGTERM or SIGINT has reached a process."""
+    """Training ends after a step and its checkpoint, because a process received SIGTERM or SIGINT."""
 
     def __init__(self, signum: int) -> None:
         super().__init__(128 + signum)
@@ -274,15 +274,15 @@ class Stopped(SystemExit):
 
 
 class CheckpointOnTermination(Callback):
-    """Ends all processes of a run behind one step and a checkpoint, once a signal has reached one of them.
+    """Ends all processes of a run after the same step and a checkpoint, once one of them receives a signal.
 
-    Before the first step a signal ends the process at once. Lightning's own handlers talk to the other
-    processes from within the signal, amid whatever they are saying to each other, and end a step that Ctrl-C
-    interrupts without a checkpoint; so they are replaced from the first step until the stage's end is kept.
+    Before the first step a signal ends the process at once. Lightning's own handlers start a collective call
+    within the signal handler, amid any other that is running, and leave no checkpoint when Ctrl-C interrupts
+    a step; so they are replaced from the first step until the stage's result is saved.
 
     Args:
-        path: of the checkpoint after a step.
-        until: closed once the stage's end is kept; a signal that came late then takes effect.
+        path: gives the checkpoint's path after a step.
+        until: closed once the stage's result is saved; a late signal then takes effect.
     """
 
     def __init__(self, path: Callable[[int], Path], until: ExitStack):
@@ -290,7 +290,7 @@ class CheckpointOnTermination(Callback):
         self._termination = Termination()
 
     def on_train_start(self, trainer: lightning.Trainer, pl_module: lightning.LightningModule) -> None:
-        """Take over the signals."""
+        """Install the signal handlers."""
         del pl_module
         line = LINE if trainer.is_global_zero else ""
         self._termination = self.until.enter_context(termination_noted(line))
@@ -303,7 +303,7 @@ class CheckpointOnTermination(Callback):
         batch: Any,
         batch_idx: int,
     ) -> None:
-        """Stop here where any process was asked to."""
+        """Stop here if any process has received a signal."""
         del outputs, batch, batch_idx
         step = trainer.global_step
         if pl_module.device.type != "cpu" and step % 10:  # asking the others waits for the GPU
@@ -317,12 +317,12 @@ class CheckpointOnTermination(Callback):
 
 
 class AveragedWeights(WeightAveraging):
-    """Average a of the weights w, after every step a + (1 - d) (w - a) with decay d.
+    """Exponential moving average a of the weights w: after every step a + (1 - d) (w - a), with decay d.
 
-    Validation sees the averages, and a stage ends with them: its file holds them and the next stage starts
+    Validation uses the averages. They are the stage's result: its file holds them and the next stage starts
     from them. A checkpoint holds both. Buffers, such as a codec's normalisation, are constants and are not
-    averaged. Frozen weights stay as they are, which Lightning's own d a + (1 - d) w does not grant: rounding
-    moves them.
+    averaged. Frozen weights stay exactly as they are; in Lightning's own d a + (1 - d) w, rounding would
+    change them.
     """
 
     def __init__(self, decay: float):

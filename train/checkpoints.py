@@ -1,6 +1,6 @@
-"""Checkpoints that survive a kill at any moment, and how a run finds where it was.
+"""Checkpoints that survive a kill at any moment, and the position that a run resumes from.
 
-`checkpoints/2-adapt-00001500.ckpt` holds everything to go on with stage 2 from step 1500; a whole stage
+`checkpoints/2-adapt-00001500.ckpt` holds everything to continue stage 2 from step 1500. A finished stage
 leaves `checkpoints/2-adapt.safetensors`, the renderer at its end, and its `.ckpt` is removed.
 """
 
@@ -25,7 +25,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
     """Lightning's checkpoints, written by fsync and rename and read without unpickling."""
 
     def save_checkpoint(self, checkpoint: dict[str, Any], path: Any, storage_options: Any = None) -> None:
-        """Write a checkpoint that is whole or not there."""
+        """Write a checkpoint atomically."""
         if storage_options is not None:
             raise TypeError("storage options are not used")
         with atomic_path(path) as temporary:
@@ -42,7 +42,7 @@ class AtomicCheckpoints(TorchCheckpointIO):
 
 @contextmanager
 def damage_told(path: Any) -> Iterator[None]:
-    """Raise TronError for whatever reading a damaged checkpoint raises: torch has a dozen types for it."""
+    """Turn any error of reading a damaged checkpoint into a TronError; torch raises a dozen types."""
     try:
         yield
     except Exception as error:
@@ -51,7 +51,7 @@ def damage_told(path: Any) -> Iterator[None]:
 
 
 def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> ModelCheckpoint:
-    """Write the run's whole state every `every` steps, keeping the newest."""
+    """Make the callback that writes the run's whole state every `every` steps and keeps the newest."""
     return ModelCheckpoint(
         dirpath=folder,
         filename=_name(number, stage),
@@ -64,17 +64,17 @@ def periodic_checkpoint(folder: Path, number: int, stage: Stage, every: int) -> 
 
 
 def checkpoint_path(folder: Path, number: int, stage: Stage, step: int) -> Path:
-    """File of a stage's whole state after a step, as `periodic_checkpoint` names it."""
+    """Path of the checkpoint after a stage's step, as `periodic_checkpoint` names it."""
     return folder / f"{_name(number, stage).format(step=step)}.ckpt"
 
 
 def _name(number: int, stage: Stage) -> str:
-    """Name of a stage's checkpoints, in which Lightning and str.format put the step."""
+    """File name pattern of a stage's checkpoints; Lightning and str.format fill in the step."""
     return f"{number}-{stage.name}-{{step:08d}}"
 
 
 def _checkpoints(folder: Path, number: int, stage: Stage) -> dict[int, Path]:
-    """Step -> file of a stage's whole state after it."""
+    """A stage's checkpoints: step -> file."""
     found = {}
     for path in folder.glob("*.ckpt"):
         step = path.stem.rpartition("-")[2]
@@ -98,7 +98,7 @@ class Position:
 
 
 def find_position(folder: Path, stages: Sequence[Stage]) -> Position:
-    """Find where a run in this folder of checkpoints was left; stage == len(stages) means it is finished."""
+    """Find the position to resume from in a folder of checkpoints; stage == len(stages): finished."""
     for index, stage in enumerate(stages):
         if stage_end(folder, index + 1, stage).is_file():
             continue
@@ -110,6 +110,6 @@ def find_position(folder: Path, stages: Sequence[Stage]) -> Position:
 
 
 def remove_checkpoints(folder: Path, number: int, stage: Stage) -> None:
-    """Remove a stage's `.ckpt` files, once its end is kept."""
+    """Remove a stage's `.ckpt` files, once its renderer is saved."""
     for path in _checkpoints(folder, number, stage).values():
         path.unlink()

@@ -1,4 +1,4 @@
-"""tron-train: the dataset folder in, output_dir/renderer.safetensors out."""
+"""tron-train: read a dataset folder, write output_dir/renderer.safetensors."""
 
 from __future__ import annotations
 

@@ -14,7 +14,7 @@ from tron.neural.clips import TEMPORAL_FACTOR
 
 FrameSide = Annotated[int, Field(ge=8, le=16_384)]
 CAPTURES = "train_b"
-"""Split of reconstructed captures, or of path-traced scenes that stand in for them."""
+"""Split of reconstructed captures, or of path-traced scenes used in their place."""
 
 
 class Stage(BaseModel):
@@ -65,7 +65,7 @@ class Stage(BaseModel):
         return value
 
     def frames_of(self, step: int) -> int:
-        """Frames K of the batch at a step: single frames are spread evenly among a video stage's batches."""
+        """Number of frames K in a step's batch: single-frame batches are spread evenly over a video stage."""
         stills = math.floor((step + 1) * self.still_ratio) - math.floor(step * self.still_ratio)
         return 1 if stills else self.frames
 
@@ -77,10 +77,10 @@ class Stage(BaseModel):
 
 
 def require_splits(stages: Sequence[Stage], there: Sequence[str]) -> None:
-    """Make sure that a curriculum's splits are there.
+    """Check that the dataset has every split of a curriculum.
 
     Raises:
-        TronError: some are not; it names all of them, those of the first stage first.
+        TronError: splits are missing; it names all of them, in the order of the stages.
     """
     lacking: dict[str, list[str]] = {}
     for stage in stages:
@@ -109,10 +109,10 @@ def require_splits(stages: Sequence[Stage], there: Sequence[str]) -> None:
 class StageClock:
     """Progress of a stage from 0 to 1: by its steps, or by its share of a time limit.
 
-    By steps a run is reproducible; by time the schedule anneals to its end within the limit on any machine,
-    and the number of steps depends on the machine. Time counts only while the stage runs: `seconds` is what
-    earlier sessions of a resumed run have spent. Progress goes by what the clock last showed, which is the
-    first process's time (`agreed`) in all that train together.
+    By steps, a run is reproducible. By time, the schedule anneals to its end within the limit on any machine,
+    and the number of steps depends on the machine. Time counts only while the stage runs; `seconds` is the
+    time spent by earlier sessions of a resumed run. Progress follows the last reading of the clock; processes
+    that train together all read the first one's time (`agreed`).
     """
 
     def __init__(
@@ -129,22 +129,22 @@ class StageClock:
         self._since: float | None = None
 
     def __deepcopy__(self, memo: dict[int, object]) -> StageClock:
-        """The clock itself: the copy of a module that weights are averaged in goes by the same time.
+        """Return the clock itself: the module's copy with averaged weights must follow the same time.
 
-        What it agrees on the time with are other processes, of which there is no copy.
+        The other processes, with which `agreed` synchronises, cannot be copied either.
         """
         return self
 
     def start(self) -> None:
-        """Let the clock run."""
+        """Start the clock."""
         self._since = time.monotonic()
 
     def stop(self) -> None:
-        """Halt the clock."""
+        """Stop the clock."""
         self.spent, self._since = self.seconds(), None
 
     def look(self) -> None:
-        """Show the time: learning rate and end of this step follow from it."""
+        """Read the time; this step's learning rate and the stage's end follow from the reading."""
         if self.seconds_limit is not None:
             self.shown = self._agreed(self.seconds())
 
@@ -153,7 +153,7 @@ class StageClock:
         return self.spent + (0.0 if self._since is None else time.monotonic() - self._since)
 
     def progress(self, step: int) -> float:
-        """Fraction of the stage that is done after `step` steps."""
+        """Fraction of the stage completed after `step` steps."""
         done = step / self.steps if self.seconds_limit is None else self.shown / self.seconds_limit
         return min(1.0, done)
 

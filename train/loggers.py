@@ -17,9 +17,9 @@ class RunLoggers:
     """Loggers of a run.
 
     Args:
-        names: of loggers; csv is always there and none of these.
-        folder: output_dir, where TensorBoard's files get into tensorboard/ and wandb's into wandb/.
-        run: hexadecimal hash of the run's settings: what wandb knows its sessions by.
+        names: loggers to use; metrics.csv is always written and has no name here.
+        folder: output_dir; TensorBoard writes into its tensorboard/, wandb into its wandb/.
+        run: hexadecimal hash of the run's settings; wandb joins the sessions of a run by it.
 
     Raises:
         TronError: a package is not installed.
@@ -29,7 +29,7 @@ class RunLoggers:
         self.names, self.folder = set(names), folder
         for name in sorted(self.names - {"csv"}):
             try:
-                # Both spelled out: a test reads literals, to hold imports against pyproject.toml.
+                # Both names are literals: a test reads them, to compare imports with pyproject.toml.
                 import_module("tensorboard") if name == "tensorboard" else import_module("wandb")
             except ImportError as error:
                 raise TronError(
@@ -40,7 +40,7 @@ class RunLoggers:
         self._wandb: WandbLogger | None = None
 
     def of_stage(self, first_step: int) -> list[Logger]:
-        """Loggers of a stage that goes on behind a step of the run; what they hold of later steps is void."""
+        """Loggers of a stage that continues after a step of the run; rows of later steps are discarded."""
         loggers: list[Logger] = []
         if "tensorboard" in self.names:
             loggers.append(TensorBoardLogger(self.folder, "tensorboard", "", purge_step=first_step + 1))
@@ -50,7 +50,7 @@ class RunLoggers:
         return loggers
 
     def close(self) -> None:
-        """Write what is left."""
+        """Flush and close."""
         if self._wandb is not None:
             self._wandb.experiment.finish()
             self._wandb = None

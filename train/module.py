@@ -33,16 +33,16 @@ class RendererModule(lightning.LightningModule):
         self.stage, self.clock = stage, clock
 
     def on_train_start(self) -> None:
-        """Start the clock: setting up and loading do not count."""
+        """Start the clock; set-up and loading are not counted."""
         self.clock.start()
 
     def on_before_optimizer_step(self, optimizer: torch.optim.Optimizer) -> None:
-        """Look at the clock."""
+        """Read the clock for this step."""
         del optimizer
         self.clock.look()
 
     def on_train_batch_end(self, *_args: Any) -> None:
-        """Stop the stage where its limit of seconds is reached."""
+        """End the stage once its time limit is reached."""
         if self.clock.seconds_limit is not None and self.clock.progress(self.global_step) >= 1:
             self.trainer.should_stop = True
 
@@ -55,7 +55,7 @@ class RendererModule(lightning.LightningModule):
         return self.loss(self.renderer(batch), batch[TARGET])
 
     def validation_step(self, batch: dict[str, Tensor], _index: int) -> None:
-        """PSNR of held-out windows, of the foreground and of the full frame: sums over frames and counts."""
+        """Add up the PSNR of held-out windows, over the foreground and over the full frame."""
         shown = self.renderer(batch)
         for row, mask in enumerate((batch["mask"], None)):
             psnr = psnr_per_frame(shown, batch[TARGET], mask)
@@ -63,11 +63,11 @@ class RendererModule(lightning.LightningModule):
             self._psnr[row] += torch.stack([psnr.sum(), psnr.new_tensor(psnr.numel())])
 
     def on_validation_epoch_start(self) -> None:
-        """Begin the sums."""
+        """Reset the sums."""
         self._psnr = torch.zeros(2, 2, device=self.device)
 
     def on_validation_epoch_end(self) -> None:
-        """Log means over the frames of all processes, which may have had different numbers of them."""
+        """Log means over the frames of all processes, whose numbers of frames may differ."""
         sums, counts = self.trainer.strategy.reduce(self._psnr, reduce_op="sum").unbind(1)
         for name, total, count in zip(("val_psnr", "val_psnr_full"), sums, counts):
             if count > 0:
@@ -75,7 +75,7 @@ class RendererModule(lightning.LightningModule):
                 self.log(name, total / count, sync_dist=True, logger=False)
 
     def configure_optimizers(self) -> Any:
-        """The stage's optimiser, with warm-up and a cosine over the stage."""
+        """Make the stage's optimiser, with warm-up and cosine decay over the stage."""
         if self.stage is None:
             raise RuntimeError("begin() chooses the stage first")
         settings, stage = self.settings, self.stage
@@ -88,10 +88,10 @@ class RendererModule(lightning.LightningModule):
         return {"optimizer": optimizer, "lr_scheduler": {"scheduler": schedule, "interval": "step"}}
 
     def on_save_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Keep the stage's name and the seconds it has run."""
+        """Store the stage's name and the seconds it has run."""
         checkpoint["tron_stage"] = self.stage.name if self.stage else ""
         checkpoint["tron_seconds"] = self.clock.seconds()
 
     def on_load_checkpoint(self, checkpoint: dict[str, Any]) -> None:
-        """Go on counting a stage's time where it was left."""
+        """Continue the stage's clock from the checkpoint's time."""
         self.clock.spent = self.clock.shown = float(checkpoint["tron_seconds"])

@@ -14,10 +14,10 @@ from tron.neural.protocols import Renderer
 
 
 def make_optimizer(renderer: Renderer, settings: OptimizerSettings) -> torch.optim.Optimizer:
-    """Optimise what is not frozen, at the settings' rates.
+    """Make the optimiser of all weights that are not frozen.
 
-    With muon_learning_rate, the matrices that the renderer names as `hidden_matrices` follow Muon
-    (orthogonalised momentum, K. Jordan 2024) and everything else AdamW.
+    With muon_learning_rate, the renderer's `hidden_matrices` use Muon (orthogonalised momentum, K. Jordan
+    2024) and all other weights AdamW.
     """
     trained = [parameter for parameter in renderer.parameters() if parameter.requires_grad]
     if settings.muon_learning_rate is None:
@@ -55,7 +55,7 @@ class CombinedOptimizer(torch.optim.Optimizer):
         self._share_groups()
 
     def _share_groups(self) -> None:
-        # The parts' own dicts: what a schedule writes into a group is what its optimiser reads.
+        # The parts' own dicts, so that a schedule's writes reach their optimiser.
         self.param_groups = [group for part in self.parts for group in part.param_groups]
         self.state = defaultdict(dict)  # each part keeps its own
 
@@ -81,17 +81,17 @@ class CombinedOptimizer(torch.optim.Optimizer):
 
 
 class Muon(torch.optim.Muon):
-    """torch.optim.Muon (K. Jordan 2024), as fast on a processor without bf16 arithmetic as on one with it.
+    """torch.optim.Muon (K. Jordan 2024), made fast on CPUs without bf16 arithmetic.
 
-    torch's orthogonalises in bf16, which such a processor emulates: 2 to 12 times the time of float32,
-    three quarters of a training step (dev/LOG.md). Here the same iteration runs in float32, on all
-    matrices of one shape at once. On a GPU torch's own is taken. Options and state are torch's; the rate is
-    adjusted to a shape as "original" does it.
+    torch's own orthogonalises in bf16, which such a CPU emulates: 2 to 12 times the time of float32, three
+    quarters of a training step (dev/LOG.md). Here the same iteration runs in float32, on all matrices of one
+    shape at once. On a GPU torch's own is used. Options and state are torch's; the rate is adjusted to a
+    matrix's shape as by torch's "original".
     """
 
     @torch.no_grad()
     def step(self, closure: Callable[[], Any] | None = None) -> Any:  # type: ignore[override]
-        """Evaluate the closure, where there is one, then change the weights; returns the closure's loss."""
+        """Evaluate the closure, if given, update the weights, and return the closure's loss."""
         loss = None
         if closure is not None:
             with torch.enable_grad():
@@ -109,7 +109,7 @@ class Muon(torch.optim.Muon):
         return loss
 
     def _change(self, matrices: list[tuple[Tensor, Tensor]], group: dict[str, Any]) -> None:
-        """Change matrices of one shape, each given with its gradient."""
+        """Update matrices of one shape, each given with its gradient."""
         rate, momentum = group["lr"], group["momentum"]
         updates = []
         for matrix, gradient in matrices:
@@ -133,7 +133,7 @@ def orthogonalised(
     steps: int = 5,
     eps: float = 1e-7,
 ) -> Tensor:
-    """(N, rows, columns) -> matrices with their singular vectors and singular values near 1.
+    """Orthogonalise (N, rows, columns): the same singular vectors, singular values near 1.
 
     The quintic Newton-Schulz iteration of Muon: X <- a X + (b A + c A A) X with A = X X^T, on matrices that
     are scaled to a Frobenius norm of 1.

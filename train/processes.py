@@ -1,7 +1,7 @@
-"""The processes of a training run, one for each device: started here, or by torchrun or Slurm.
+"""The processes of a training run, one for each device, started here, by torchrun or by Slurm.
 
-Lightning's own launcher runs the command line again and kills without a word; here the processes are spawned
-from the checked settings and watched, so that whatever ends one of them ends all, with its reason.
+Lightning's own launcher runs the command line again and kills processes without a message. Here they are
+spawned from the checked settings and watched: if one ends, all end, and the reason is reported.
 """
 
 from __future__ import annotations
@@ -33,7 +33,7 @@ from tron.errors import TronError
 from tron.termination import TERMINATED, termination_unwinds
 
 GRACE_SECONDS = 15.0
-"""Seconds that processes have to end by themselves after one of them has failed or was interrupted."""
+"""Seconds in which the other processes may end by themselves after one has failed or was interrupted."""
 CHECKPOINT_SECONDS = 120.0
 """Seconds that processes have to finish their step and write a checkpoint after SIGTERM or Ctrl-C."""
 
@@ -42,7 +42,7 @@ Result = TypeVar("Result")
 
 @dataclass(frozen=True)
 class Processes:
-    """This process's rank among those that train together, and what passes between their CPUs."""
+    """This process's rank among the training processes, and the exchange between their CPUs."""
 
     rank: int = 0
     count: int = 1
@@ -50,18 +50,18 @@ class Processes:
 
     @property
     def first(self) -> bool:
-        """Whether this is global rank 0, which alone locks, writes and speaks."""
+        """Whether this is global rank 0, the only one that locks, writes and logs."""
         return self.rank == 0
 
     def from_first(self, work: Callable[[], Result]) -> Result:
-        """Result of `work` in the first process, which alone does it; its TronError ends all processes."""
+        """Run `work` in the first process and return its result in all; its TronError ends all processes."""
         outcome = [_outcome(work) if self.first else None]
         if self.count > 1:
             distributed.broadcast_object_list(outcome, src=0, group=self.group)
         return self._unless_failed(outcome[0], [outcome[0]])
 
     def together(self, work: Callable[[], Result]) -> Result:
-        """Result of `work` in this process, done by each; the TronError of any of them ends all."""
+        """Run `work` in every process and return this one's result; a TronError in any ends all."""
         own = _outcome(work)
         failures: list[Any] = [own if isinstance(own, TronError) else None] * self.count
         if self.count > 1:
@@ -82,7 +82,7 @@ class Processes:
             return outcome
         if self.first:
             raise error
-        raise SystemExit(USER_ERROR)  # one process says it
+        raise SystemExit(USER_ERROR)  # one process logs it
 
 
 def _outcome(work: Callable[[], Result]) -> Result | TronError:
@@ -96,8 +96,8 @@ def launch(work: Callable[[Processes, Settings], None], settings: Settings) -> N
     """Do `work` in every process of a run: this one, new ones, or those that torchrun or srun has started.
 
     Raises:
-        TronError: devices, nodes, accelerator or precision that this machine has not; or what any process
-            raised.
+        TronError: this machine lacks the devices, nodes, accelerator or precision; or any process raised
+            one.
         KeyboardInterrupt: a process was interrupted; all have ended.
     """
     _quiet_lightning()
@@ -135,7 +135,7 @@ def _outer_launcher() -> Any:
 
 
 def _devices(settings: Settings, outer: Any) -> int:
-    """Number of devices of this machine that train; TronError where it has fewer."""
+    """Number of this machine's devices to train on; TronError if it has fewer."""
     fabric = _fabric(settings, settings.devices, 1)
     on_cpu = fabric.device.type == "cpu"
     if settings.devices == "auto" and on_cpu and outer is not None:
@@ -165,18 +165,18 @@ def _fabric(settings: Settings, devices: int | str, nodes: int, **more: Any) -> 
 
 @contextmanager
 def _joined(settings: Settings, devices: int) -> Iterator[Processes]:
-    """Join the other processes of the run, which do the same; the process group ends with the block."""
+    """Join the run's process group, which ends with the block."""
     if devices * settings.nodes == 1:
         yield Processes()
         return
-    if settings.threads is not None:  # else Lightning would share all cores among this machine's processes
+    if settings.threads is not None:  # else Lightning would divide all cores among this machine's processes
         os.environ["OMP_NUM_THREADS"] = str(settings.threads)
     fabric = _fabric(settings, devices, settings.nodes, strategy="ddp")
     fabric.launch()
     processes = Processes(fabric.global_rank, fabric.world_size, distributed.new_group(backend="gloo"))
     if processes.first:
         configure_logging()
-    else:  # it would only say again what the first one says
+    else:  # it would only repeat the first one's lines
         logging.getLogger().setLevel(logging.ERROR)
         warnings.simplefilter("ignore")
     try:
@@ -188,7 +188,7 @@ def _joined(settings: Settings, devices: int) -> Iterator[Processes]:
 
 
 def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devices: int) -> None:
-    """Start this machine's processes, wait for them, and end them all as the first to fail has ended."""
+    """Start this machine's processes and wait for them; if one fails, end all with its error."""
     if settings.nodes > 1:
         raise TronError(f"nodes={settings.nodes} without a launcher", mend="start it by torchrun or srun")
     port = str(find_free_network_port())
@@ -215,7 +215,7 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
             mend="if that was for want of memory, make batch_size or data.cache_gb smaller",
         ) from error
     except (SystemExit, KeyboardInterrupt) as asked:
-        # They finish their step, write a checkpoint, and judge what comes after it.
+        # They finish their step, write a checkpoint, and handle later signals themselves.
         number = signal.SIGINT if isinstance(asked, KeyboardInterrupt) else signal.SIGTERM
         before = signal.signal(number, lambda *_: _tell(context.processes, number))
         _end(context.processes, number, CHECKPOINT_SECONDS)
@@ -226,7 +226,7 @@ def _spawn(work: Callable[[Processes, Settings], None], settings: Settings, devi
 
 
 def _end(processes: list[Any], gently: signal.Signals, grace: float) -> None:
-    """Ask what still runs to end, and kill what does not listen."""
+    """Terminate the running processes, and kill those that do not end."""
     for number, seconds in ((gently, grace), (signal.SIGKILL, None)):
         running = _tell(processes, number)
         deadline = None if seconds is None else time.monotonic() + seconds
@@ -235,10 +235,10 @@ def _end(processes: list[Any], gently: signal.Signals, grace: float) -> None:
 
 
 def _tell(processes: list[Any], number: signal.Signals) -> list[Any]:
-    """Send a signal to what still runs; these processes."""
+    """Send a signal to the running processes and return them."""
     running = [process for process in processes if process.is_alive()]
     for process in running:
-        with suppress(ProcessLookupError):  # ended since
+        with suppress(ProcessLookupError):  # it has ended meanwhile
             os.kill(process.pid, number)
     return running
 
@@ -264,7 +264,7 @@ def _spawned(
 
 
 def _quiet_lightning() -> None:
-    """Lightning's start-up lines and advice on loaders say nothing about this run."""
+    """Silence Lightning's start-up lines and its advice on loaders."""
     logging.getLogger("lightning.pytorch").setLevel(logging.WARNING)
     logging.getLogger("lightning.fabric").setLevel(logging.WARNING)
     for message in (

@@ -1,4 +1,4 @@
-"""One training run: stage after stage, from wherever it was left."""
+"""One training run: stage after stage, resumed from where it stopped."""
 
 from __future__ import annotations
 
@@ -62,7 +62,7 @@ log = logging.getLogger(__name__)
 
 RENDERER_NAME = "renderer.safetensors"
 MAY_CHANGE = ("output_dir", "dataset", "splits", "start_from", "devices", "nodes", "logger")
-"""A run may move, and be watched in other ways; data and first weights are known by their hash."""
+"""Settings that may change when a run resumes; data and first weights are compared by hash instead."""
 
 
 def run(settings: Settings) -> None:
@@ -75,7 +75,7 @@ def run(settings: Settings) -> None:
 
 
 def train(processes: Processes, settings: Settings) -> None:
-    """Work of each process of a run; the first holds the folder and writes."""
+    """The work of each process of a run; the first locks the folder and writes."""
     if settings.threads is not None:
         set_torch_threads(settings.threads)
     stages = [stage for stage in settings.stages if stage.steps > 0]
@@ -95,13 +95,13 @@ def train(processes: Processes, settings: Settings) -> None:
         if position is None:
             return
         module = processes.together(lambda: _make_module(settings, stages, position, data))
-        # Only now: what is wrong with a first attempt's settings must not bind the second.
+        # Only now: a first attempt with wrong settings must not bind the second one to them.
         processes.from_first(lambda: _keep_settings(settings, described))
         if position == Position(0) and settings.start_from is None:
             _calibrate(module.renderer, data, stages, processes)
         for index in range(position.stage, len(stages)):
             here = position if index == position.stage else Position(index)
-            with ExitStack() as kept:  # signals wait for its end once the first step has begun
+            with ExitStack() as kept:  # from the first step on, signals wait until it is closed
                 _run_stage(settings, stages, here, module, data, processes, loggers, kept)
                 processes.from_first(partial(_end_stage, folder, index + 1, stages[index], module))
         path = settings.output_dir / RENDERER_NAME
@@ -110,10 +110,10 @@ def train(processes: Processes, settings: Settings) -> None:
 
 
 def _described(settings: Settings, processes: int) -> dict[str, Any]:
-    """Settings as plain values, with the hashes of what they name.
+    """Settings as plain values, with the hashes of the files they name.
 
-    Batches are as many as there are processes: the run remembers their number, not how they were spread.
-    TronError where the dataset or `start_from` cannot be read.
+    Batch size grows with the number of processes, so the run records their total, not their layout.
+    TronError if the dataset or `start_from` cannot be read.
     """
     described = yaml.safe_load(yaml.safe_dump(settings.model_dump(mode="json")))
     described["dataset_sha256"] = manifest_hash(settings.dataset)
@@ -133,7 +133,7 @@ def _loggers(settings: Settings, described: dict[str, Any]) -> RunLoggers:
 def _claim(
     held: ExitStack, settings: Settings, described: dict[str, Any], stages: list[Stage]
 ) -> Position | None:
-    """Hold the output folder, which must be this run's, and find where it stands; None if it is finished."""
+    """Lock the output folder, which must be this run's, and find its position; None if it is finished."""
     held.enter_context(locked(settings.output_dir))
     kept = [key for key in described if key not in MAY_CHANGE]
     earlier = RunFolder(settings.output_dir).recipe() or described
@@ -154,7 +154,7 @@ def _keep_settings(settings: Settings, described: dict[str, Any]) -> None:
 def _make_module(
     settings: Settings, stages: list[Stage], position: Position, data: TrainingData
 ) -> RendererModule:
-    """The renderer as what came before the position left it, with its loss; the data are opened for it."""
+    """Open the data and make the module, with the renderer's weights from before the position."""
     torch.manual_seed(seeds.integer(settings.seed, "train", "weights", bits=63))
     renderer = build_renderer(settings.renderer)
     for stage in stages:
@@ -172,7 +172,7 @@ def _make_module(
 
 
 def _calibrate(renderer: Renderer, data: TrainingData, stages: list[Stage], processes: Processes) -> None:
-    """Calibrate in the first process; the constants of the others become its own."""
+    """Calibrate in the first process and copy its constants to the others."""
 
     def constants() -> dict[str, torch.Tensor]:
         renderer.calibrate(data.calibration(stages, renderer.temporal_factor))
@@ -183,10 +183,10 @@ def _calibrate(renderer: Renderer, data: TrainingData, stages: list[Stage], proc
 
 
 def build_renderer(recipe: dict[str, Any]) -> Renderer:
-    """Make the renderer that a recipe's `_target_` names, ours or of one's own.
+    """Make the renderer that a recipe's `_target_` names, TRON's or the user's.
 
     Raises:
-        TronError: the recipe does not fit it, it is no Renderer, or its weights could not be read again.
+        TronError: the recipe does not fit it, it is no Renderer, or its weights could not be reloaded.
     """
     renderer = make(_with_settings(recipe), "renderer")
     if not isinstance(renderer, Renderer):
@@ -199,16 +199,16 @@ def build_renderer(recipe: dict[str, Any]) -> Renderer:
 
 
 def _with_settings(recipe: dict[str, Any]) -> dict[str, Any]:
-    """A recipe whose `config` says of which class it is, where its `_target_` is a renderer that knows.
+    """Add the class to a recipe's `config`, if its `_target_` is a renderer that declares one.
 
     Raises:
-        TronError: it says that it is of another class, such as the default network's.
+        TronError: the recipe names another class, such as the default network's.
     """
     config = recipe.get("config")
     try:
         cls = hydra.utils.get_class(recipe["_target_"])
         given = hydra.utils.get_class(config["_target_"]) if config and "_target_" in config else None
-    except Exception:  # whoever makes it says what is wrong
+    except Exception:  # its construction will report the error
         return recipe
     if not isinstance(config, dict) or not issubclass(cls, Renderer):
         return recipe
@@ -304,7 +304,7 @@ def make_trainer(
     loggers: RunLoggers,
     kept: ExitStack,
 ) -> lightning.Trainer:
-    """Trainer of the stage that `data` has begun, from a position on; signals wait until `kept` is closed."""
+    """Trainer for the stage that `data` has begun, from a position on; signals wait until `kept` closes."""
     stage = data.stage
     assert stage is not None
     earlier = steps_before(earlier_rows(_metrics(settings), stage.name, position.step), stage.name)
@@ -334,7 +334,7 @@ def make_trainer(
 def _strategy(settings: Settings, processes: Processes) -> Literal["auto"] | Strategy:
     if settings.strategy == "fsdp":
         return ShardedStrategy(processes)
-    # Buffers are constants here; broadcasting them would also tie together how often ranks validate.
+    # Buffers are constants here; broadcasting them would also force all ranks to validate equally often.
     return "auto" if processes.count == 1 else DDPStrategy(broadcast_buffers=False)
 
 
@@ -351,7 +351,7 @@ def _callbacks(
     earlier: int,
     kept: ExitStack,
 ) -> list[Callback]:
-    """In this order: averages are formed and shown before anything else looks at the weights."""
+    """Callbacks in order: weights are averaged and swapped in before any other callback reads them."""
     folder, number = settings.output_dir / "checkpoints", position.stage + 1
     decay = settings.optimizer.ema_decay
     damage = DamageCount(stage, settings.data.damaged_limit, settings.checkpoint_every)

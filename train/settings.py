@@ -15,7 +15,7 @@ from tron.shards.dataset_folder import DatasetPlace
 LoggerName = Literal["csv", "tensorboard", "wandb"]
 
 HELD_OUT = "test"
-"""The split that evaluation judges by; so are those whose names begin with it, as test_relit."""
+"""The split used by evaluation; splits whose names begin with it, such as test_relit, are too."""
 
 
 class OptimizerSettings(BaseModel):
@@ -65,10 +65,11 @@ class LossSettings(BaseModel):
         "gain nothing. Lower it with data.mend; otherwise frames that are already right "
         "dominate the loss.",
     )
-    gradient: float = Field(
+    sharpness: float = Field(
         default=0.0,
         ge=0,
-        description="Weight of the absolute error of differences between neighbours: edges and relief.",
+        description="Weight of what gradients lack of the truth's strength, in windows of 16 x 16 pixels: "
+        "errors of values alone are least where unknown detail is blurred.",
     )
     lpips: float = Field(default=1.0, ge=0, description="Weight of LPIPS (VGG); needs vgg_weights.")
     vgg_weights: Path | None = Field(
@@ -134,7 +135,7 @@ class DataSettings(BaseModel):
 
 
 class ValidationSettings(BaseModel):
-    """Clips whose PSNR is shown while training; nothing is selected or stopped by it."""
+    """Clips whose PSNR is shown during training; it selects no checkpoint and stops nothing early."""
 
     DEFAULT: ClassVar[str] = "validation"
 
@@ -159,16 +160,16 @@ class ValidationSettings(BaseModel):
     )
 
 
-# Half of the samples come from stage 1's split, against forgetting it.
+# Half of the samples come from stage 1's split, so that it is not forgotten.
 _REHEARSED: dict[str, Any] = {"rehearsal_split": "train", "rehearsal_ratio": 0.5, "learning_rate": 0.5}
 THREE_STAGES = [
     Stage(name="synthetic", split="train", steps=3000, crop=64),
     Stage(name="adapt", split="train_b", steps=1000, crop=64, **_REHEARSED),
     Stage(name="video", split="train_b", frames=5, steps=1000, batch_size=4, crop=64, **_REHEARSED),
 ]
-"""The paper's curriculum; a second path-traced split of another distribution replaces real photographs.
+"""The paper's curriculum, with a second path-traced split of another distribution for real photographs.
 
-It shows that the curriculum works, not what real data would add.
+It shows that the curriculum works, but not the gain from real data.
 """
 
 
@@ -304,17 +305,17 @@ def _require_training_split(name: str, split: str | None) -> None:
 
 @dataclass(frozen=True)
 class SplitPlace:
-    """A dataset's folder or URL, and the names of those of its splits that are one here."""
+    """A dataset's folder or URL, and the names of its splits that are joined into one."""
 
     folder: str
     splits: tuple[str, ...]
 
     @classmethod
     def parse(cls, name: str, value: str) -> SplitPlace:
-        """Place of the split that a run calls ``name``: FOLDER or FOLDER#SPLIT or FOLDER#SPLIT+SPLIT.
+        """Parse the place of the split that a run calls ``name``: FOLDER[#SPLIT[+SPLIT...]].
 
         Raises:
-            ValueError: it is none of these, or names a split twice.
+            ValueError: the text has another form, or names a split twice.
         """
         folder, mark, joined = value.rpartition("#")
         splits = tuple(joined.split("+")) if mark else (name,)

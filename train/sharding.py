@@ -1,8 +1,8 @@
 """Training with weights, gradients and optimiser state in shards (strategy=fsdp), each process holding one.
 
 torch's FSDP2 shards every tensor along its first axis, block by block, on GPUs and, by gloo, on the CPU. A
-stage trains a sharded copy of the renderer; the whole one stays on the CPU of each process and takes the
-weights over at the stage's end. Validation gathers all weights for as long as it lasts.
+stage trains a sharded copy of the renderer; the unsharded one stays on the CPU of each process and receives
+the weights at the stage's end. During validation every process holds all weights.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ WHOLE = StateDictOptions(full_state_dict=True)
 
 
 def require_shardable(settings: Settings, processes: Processes) -> None:
-    """TronError where the run cannot be sharded."""
+    """Raise TronError if the run cannot be sharded."""
     if settings.strategy != "fsdp":
         return
     if processes.count == 1:
@@ -50,7 +50,7 @@ class ShardedModule(RendererModule):
         self._sharded = False
 
     def configure_model(self) -> None:
-        """Shard the transformer's blocks one by one, then what is left; Lightning calls it more than once."""
+        """Shard each block of the transformer, then all other weights; Lightning calls it more than once."""
         if self._sharded:
             return
         mesh = self.device_mesh
@@ -62,14 +62,14 @@ class ShardedModule(RendererModule):
         self._sharded = True
 
     def on_validation_epoch_start(self) -> None:
-        """Have all weights in every process: clips are shared out unevenly, and gathering takes everybody."""
+        """Gather all weights in every process now: gathering needs all, and their clip counts differ."""
         super().on_validation_epoch_start()
         for part in self._parts():
             part.set_reshard_after_forward(False, recurse=False)
             part.unshard()
 
     def on_validation_epoch_end(self) -> None:
-        """Go back to shards."""
+        """Shard the weights again."""
         for part in self._parts():
             part.reshard()
             part.set_reshard_after_forward(part is not self.renderer, recurse=False)
@@ -79,20 +79,20 @@ class ShardedModule(RendererModule):
         return [part for part in self.renderer.modules() if isinstance(part, FSDPModule)]
 
     def give_weights_to(self, whole: RendererModule) -> None:
-        """Gather the weights into a module that is whole, in every process."""
+        """Gather the weights into an unsharded module, in every process."""
         state: dict[str, Any] = get_model_state_dict(self, options=WHOLE)
         whole.load_state_dict({name: tensor.cpu() for name, tensor in state.items()})
 
 
 def _copied(renderer: Renderer) -> Renderer:
-    # A frozen codec that is no module (the WAN VAE, half a gigabyte) is shared.
+    # A frozen codec that is not a module (the WAN VAE, half a gigabyte) is shared.
     codec = getattr(renderer, "codec", None)
     shared = {} if codec is None or isinstance(codec, nn.Module) else {id(codec): codec}
     return copy.deepcopy(renderer, shared)
 
 
 class ShardedStrategy(ModelParallelStrategy):
-    """Lightning's strategy for FSDP2, with whole checkpoints, read without unpickling."""
+    """Lightning's strategy for FSDP2, with unsharded checkpoints, read without unpickling."""
 
     def __init__(self, processes: Processes):
         super().__init__(
@@ -100,7 +100,7 @@ class ShardedStrategy(ModelParallelStrategy):
         )
 
     def load_checkpoint(self, checkpoint_path: Any, weights_only: bool | None = None) -> dict[str, Any]:
-        """Each process reads the whole file and keeps its shard; the rest of the checkpoint is returned."""
+        """Read the whole file, keep this process's shard, and return the rest of the checkpoint."""
         del weights_only
         with damage_told(checkpoint_path):
             return super().load_checkpoint(checkpoint_path, weights_only=True)

@@ -24,19 +24,19 @@ from tron.shards.schema import TARGET
 from tron.storage import write_atomic
 
 WIDEST = 384
-"""Pixels that a frame is shown with at most; larger ones are made smaller by means of areas."""
+"""Largest width of a shown frame, pixels; wider frames are downsampled by area."""
 HEADER = 16
 
 
 class ValidationStrips(Callback):
-    """Writes validation/STAGE-STEP.png at each validation: a row a frame, the same frames every time.
+    """Writes validation/STAGE-STEP.png at each validation: one row per frame, the same frames every time.
 
-    The frames are the middle ones of the first windows of a few clips of the validation split, those of the
-    first process; the network is the one that is validated, under EMA the averaged one.
+    Each frame is the middle one of a clip's first window, for a few of the validation clips of the first
+    process. The network is the one being validated: with EMA, the averaged weights.
 
     Args:
-        folder: output_dir. stage: that is trained. data: its validation clips.
-        earlier_steps: of the run's stages before it.
+        folder: output_dir. stage: the stage being trained. data: its validation clips.
+        earlier_steps: steps of the run's earlier stages.
     """
 
     def __init__(self, folder: Path, stage: Stage, data: TrainingData, earlier_steps: int):
@@ -53,7 +53,7 @@ class ValidationStrips(Callback):
     ) -> None:
         """Render the frames before the first batch, with averaged weights in place and shards gathered.
 
-        At the epoch's start a callback comes before the module, and gathering takes all processes.
+        At the epoch's start it would be too early: callbacks run before the module gathers the shards.
         """
         del batch, dataloader_idx
         assert isinstance(pl_module, RendererModule)
@@ -89,7 +89,7 @@ def _shown(video: Tensor) -> np.ndarray:
 
 
 def with_header(picture: np.ndarray, names: tuple[str, ...]) -> np.ndarray:
-    """Picture (H, W, 3) uint8 of columns of one width under a line with their names."""
+    """Picture (H, W, 3) uint8 under a header line that names its columns, all of one width."""
     width = picture.shape[1] // len(names)
     header = Image.new("RGB", (picture.shape[1], HEADER))
     draw = ImageDraw.Draw(header)

@@ -1,4 +1,4 @@
-"""Options of a transformer's blocks: recomputed in the backward pass, compiled."""
+"""Options of a transformer's blocks: activation checkpointing and compilation."""
 
 from __future__ import annotations
 
@@ -16,14 +16,14 @@ def transformers(module: nn.Module) -> list[CosmosTransformer3DModel]:
 
 
 def transformer_blocks(module: nn.Module) -> list[nn.Module]:
-    """The blocks of its transformers: what is recomputed, compiled and sharded one at a time."""
+    """The blocks of its transformers, each recomputed, compiled and sharded by itself."""
     return [block for each in transformers(module) for block in each.transformer_blocks]
 
 
 def require_compiler(settings: Settings) -> None:
-    """TronError where `compile` is asked for and torch.compile does not work on the device that trains.
+    """Raise TronError if `compile` is set and torch.compile fails on the training device.
 
-    A compiler that is there may still fail, so a function is compiled: seconds, before hours of training.
+    An installed compiler may still fail, so a small function is compiled first, which takes seconds.
     """
     if not settings.compile:
         return
@@ -43,10 +43,10 @@ def _trial(x: torch.Tensor) -> torch.Tensor:
 
 
 def apply_options(renderer: nn.Module, settings: Settings) -> None:
-    """Have the renderer's transformer recompute its blocks and compile them, as the settings say.
+    """Recompute and compile the blocks of the renderer's transformer, as the settings say.
 
     Raises:
-        TronError: the renderer has no transformer to do so with.
+        TronError: the renderer has no transformer.
     """
     asked = [
         name

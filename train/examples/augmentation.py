@@ -16,20 +16,20 @@ from tron.errors import TronError
 from tron.shards.schema import MEMBERS, TARGET, encoded
 
 START = "lit"
-"""Buffer that is the picture, but for what a network mends."""
+"""Buffer that the network corrects into the picture."""
 
 
 def augmented(
     sample: Sample, random: np.random.Generator, crop: int | None, settings: DataSettings
 ) -> Sample:
-    """Crop, mirror, turn, recolour and expose a sample, its buffers all alike.
+    """Crop, mirror, rotate, recolour and expose a sample, all its buffers alike.
 
-    Colours are changed in linear light, where permuting and scaling channels of the light gives exactly the
-    permuted and scaled buffers: transport is linear and no channel knows another. A tint keeps the
+    Colours are changed in linear light, where permuting and scaling the light's channels gives exactly the
+    permuted and scaled buffers: transport is linear and channels are independent. A tint keeps the
     luminance of white, so that the exposure rule still holds; a random exposure, a gain on all channels,
-    leaves that rule on purpose. Samples with display members keep their colours. A turned picture is what a
-    rolled camera sees: no buffer holds a direction that would have to turn with it. Reflectance has its
-    colours exchanged, and no light to scale; what is no colour stays. Last, lit is mended in a share of all.
+    breaks that rule on purpose. Samples with display members keep their colours. A rotated picture is that
+    of a rolled camera: no buffer holds a direction that would have to rotate too. Reflectance has its
+    channels permuted but not scaled; non-colour buffers stay. Last, `mended` corrects some samples' ``lit``.
     """
     height, width = sample.buffers[TARGET].shape[-2:]
     rows, columns = slice(None), slice(None)
@@ -43,7 +43,7 @@ def augmented(
     mirrored = random.random() < settings.flip
     order = random.permutation(3) if random.random() < settings.permute_colors else np.arange(3)
     tint = np.exp(settings.tint * random.standard_normal(3))
-    # What came later is drawn only where it is asked for: other runs keep their random numbers.
+    # Options added later draw only if they are set, so that older runs keep their random numbers.
     stops = settings.exposure * random.standard_normal() if settings.exposure else 0.0
     gains = torch.tensor(tint / luminance(tint) * 2.0**stops, dtype=torch.float32).view(3, 1, 1, 1)
     turns = _quarter_turns(random, settings.rotate, (height, width) if crop is None else (crop, crop))
@@ -59,10 +59,10 @@ def augmented(
 
 
 def mended(sample: Sample, random: np.random.Generator, share: float) -> Sample:
-    """A sample, in a share of all cases with a ``lit`` that is less wrong: w truth + (1 - w) lit, linear.
+    """Replace ``lit`` by w truth + (1 - w) lit, linear, in a given share of the samples.
 
-    w is 1 in half of them, else uniform in [0, 1]. The truth's noise comes with it and is what is asked for:
-    such a sample says that nothing is to be done. Samples without lit, and photographs, stay.
+    w is 1 in half of these, else uniform in [0, 1]. The truth's noise is mixed in on purpose: such a sample
+    teaches the network to change nothing. Samples without lit, and photographs, stay.
     """
     if not share or random.random() >= share:
         return sample

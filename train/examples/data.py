@@ -1,8 +1,8 @@
-"""Batches for training: which clips, frames and crops make a batch depends on seed, stage and step alone.
+"""Batches for training: a batch's clips, frames and crops depend on seed, stage and step alone.
 
-A split that fits the memory budget is decoded once and kept (on two cores decoding would dominate); of a
-larger one each sample reads the frames it needs. Both give the same batches, so resuming at step s gives the
-batches that an uninterrupted run would have seen from s on, without looking at earlier ones.
+A split that fits the memory budget is decoded once and kept (on two cores decoding would dominate); from a
+larger split each sample reads the frames it needs. Both give the same batches. A run resumed at step s gets
+the same batches from s on as an uninterrupted run, without reading earlier ones.
 """
 
 from __future__ import annotations
@@ -43,15 +43,15 @@ from tron.shards.streaming import StreamedClips
 log = logging.getLogger(__name__)
 
 DAMAGED = "damaged"
-"""Key of a batch: how many of its samples stand in for damaged ones."""
+"""Key of a batch: the number of its samples that replace damaged ones."""
 
 
 class Batches(IterableDataset):
     """Endless batches {member: (B, 3, K, h, w), damaged: count} of one stage, from step `first_step` on.
 
-    Batch s is a function of (seed, stage, s), so that a resumed run has the same ones, whatever its number of
-    loader processes. Ranks share it: together the batches of R ranks are the batch of R times the size that
-    one process would have.
+    Batch s is a function of (seed, stage, s), so that a resumed run has the same batches with any number of
+    loader processes. The batches of R ranks together are the batch that one process would draw at R times
+    the size.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class Batches(IterableDataset):
             except TronError as error:
                 if worker is None:
                     raise
-                yield error  # `Loader` raises it: torch would make a traceback of many lines of it
+                yield error  # `Loader` raises it: torch would turn it into a traceback of many lines
                 return
             step += workers
 
     def _plan(self, step: int) -> list[tuple[str, int, int]]:
-        """(split, number within that split's samples, number within all samples) of a batch's samples.
+        """For each sample of a batch: its split, its number in that split, its number in all samples.
 
         Rehearsal is spread evenly: of any n samples in a row, ratio * n come from the rehearsal split.
         """
@@ -128,13 +128,13 @@ class Loader(DataLoader):
 
 
 def _leave_signals(_worker: int) -> None:
-    """Leave a signal that reaches a whole group of processes to the one that trains: it wants its batch."""
+    """Ignore signals sent to the whole process group: the training process still needs its batch."""
     signal.signal(signal.SIGINT, signal.SIG_IGN)
     signal.signal(signal.SIGTERM, lambda *_: signal.signal(signal.SIGTERM, signal.SIG_DFL))
 
 
 class TrainingData(lightning.LightningDataModule):
-    """A run's splits, in memory where they fit, and batches for one stage at a time."""
+    """A run's splits, in memory if they fit, and batches for one stage at a time."""
 
     def __init__(
         self,
@@ -161,12 +161,12 @@ class TrainingData(lightning.LightningDataModule):
             log.info("No validation: this dataset has no split '%s'", default)
             self.validation_split = None
         elif validation.split is not None:
-            self.splits.clips(validation.split)  # a wrong name ends the run now, not after hours
+            self.splits.clips(validation.split)  # a wrong name fails now, not after hours
 
     def open(self, stages: Sequence[Stage], guidance: Sequence[str] = GUIDANCE) -> None:
         """Check that every stage finds its splits, frames and sizes; decode the splits that fit in memory.
 
-        guidance: members that the network is conditioned on.
+        guidance: the members that condition the network.
         """
         require_splits(stages, self.splits.names())
         self.members = (*guidance, TARGET)
@@ -195,11 +195,11 @@ class TrainingData(lightning.LightningDataModule):
         return IndexedSplit(clips, split, self.members, self.seed, self.settings.mix_lights)
 
     def first_meta(self, split: str) -> ClipMeta:
-        """Metadata of a split's first clip that has them; TronError where there is no such split or clip."""
+        """First readable metadata of a split's clips; TronError if there is no such split or clip."""
         return first_whole(self.splits.clips(split))
 
     def photographs(self, split: str) -> bool:
-        """Whether a split's pictures are display-encoded, as photographs are; all of them in a joined one."""
+        """Whether all of a split's pictures are display-encoded, as photographs are."""
         firsts = firsts_whole(self.splits.clips(split))
         return all(first.color_space.get(TARGET) == "display" for first in firsts)
 
@@ -208,7 +208,7 @@ class TrainingData(lightning.LightningDataModule):
         return split == CAPTURES and not self.photographs(split)
 
     def calibration(self, stages: Sequence[Stage], temporal_factor: int, clips: int = 64) -> Iterator[Tensor]:
-        """Training videos (1, 3, K, H, W), all buffers, of the longest stage's K, to calibrate a codec on."""
+        """Training videos (1, 3, K, H, W) of all buffers, to calibrate a codec: the longest stage's K."""
         longest = max(stage.frames for stage in stages)
         for split in dict.fromkeys(split for stage in stages for split in stage.splits()):
             store = self.splits.clips(split)
@@ -220,13 +220,13 @@ class TrainingData(lightning.LightningDataModule):
                 try:
                     whole = range(min(frames, store.meta(number).frames))
                     clip = centred(store.read_frames(number, whole, self.members), size)
-                except TronError:  # damaged: samples of it will be replaced too, counted and named
+                except TronError:  # damaged: its samples will be replaced too, counted and named
                     continue
                 for name in self.members:
                     yield network_input(clip, name)[None]
 
     def begin(self, stage: Stage, first_step: int) -> None:
-        """Choose the stage, and the step to go on from, of the loaders made next."""
+        """Choose the stage and the first step of the loaders made next."""
         self.stage, self.first_step = stage, first_step
 
     def train_dataloader(self) -> DataLoader:
@@ -256,7 +256,7 @@ class TrainingData(lightning.LightningDataModule):
         return DataLoader(windows, batch_size=None)
 
     def pictured_windows(self, stage: Stage) -> Iterator[dict[str, Tensor]]:
-        """First windows (1, 3, K, H, W) of a few of this process's held-out clips, without damaged ones."""
+        """First windows (1, 3, K, H, W) of a few undamaged held-out clips of this process."""
         if self.validation_split is not None and self.validation.pictures:
             yield from first_windows(self._held_out_clips(), stage, self.validation.pictures)
 

@@ -1,9 +1,9 @@
-"""Frames brought to a stage's size: made smaller until they just cover it, then cut.
+"""Resize frames to a stage's size: downsample them until they just cover it, then crop.
 
-An output pixel is the mean of the area of the input that it covers (fractions of pixels count by their
-share), which is what a camera with larger pixels would have seen: constants stay, and so does the sum of the
-light over a frame. Means are taken of linear light, before tone mapping; display-encoded frames are decoded
-by the sRGB curve for it, and encoded again. Width and height shrink alike but for rounding to whole pixels.
+An output pixel is the mean over the input area that it covers, with partly covered pixels weighted by their
+share, as a camera with larger pixels would see it. Constant pictures stay constant and a frame's mean light
+is kept. Means are taken in linear light, before tone mapping; display-encoded frames are decoded by the sRGB
+curve first and encoded again. Width and height shrink by the same factor, up to rounding to whole pixels.
 """
 
 from __future__ import annotations
@@ -23,7 +23,7 @@ from tron.shards.schema import MEMBERS, TARGET, Clip
 Size = tuple[int, int]
 """Width and height, pixels."""
 ALIGNMENT = 4
-"""Windows start at multiples of this: it keeps the codec's blocks."""
+"""Windows start at multiples of this many pixels, which keeps the codec's blocks aligned."""
 
 
 def channels_first(frames: np.ndarray) -> np.ndarray:
@@ -36,9 +36,9 @@ class Sample:
     """Frames of one clip.
 
     Attributes:
-        buffers: (3, K, H, W) by name: linear under the clip's exposure, or in [0, 1] where display-encoded.
-        display: names of the display-encoded ones.
-        stands_in: whether it is there in the place of a damaged one.
+        buffers: (3, K, H, W) by name: linear with the clip's exposure applied, or display-encoded in [0, 1].
+        display: names of the display-encoded buffers.
+        stands_in: whether it replaces a damaged sample.
     """
 
     buffers: dict[str, Tensor]
@@ -47,13 +47,13 @@ class Sample:
 
     @classmethod
     def of(cls, clip: Clip) -> Sample:
-        """All frames of a clip, in the members that it was read with."""
+        """Make a sample of all frames and members that were read of a clip."""
         buffers = {name: torch.from_numpy(channels_first(clip.exposed(name))) for name in clip.frames}
         return cls(buffers, frozenset(name for name in buffers if clip.is_display(name)))
 
 
 def covering_size(frame: Size, size: Size) -> Size:
-    """Smallest size with a frame's aspect that covers another; TronError where the frame itself does not."""
+    """Smallest size with a frame's aspect that covers another; TronError if the frame is smaller."""
     if frame[0] < size[0] or frame[1] < size[1]:
         raise TronError(
             f"frames of {frame[0]} x {frame[1]} are smaller than the stage's size, {size[0]} x {size[1]}",
@@ -65,7 +65,7 @@ def covering_size(frame: Size, size: Size) -> Size:
 
 
 def area_resized(video: Tensor, size: Size) -> Tensor:
-    """(..., H, W) at most as large, every pixel the mean of its area; the same tensor if it has that size."""
+    """Downsample (..., H, W) by area means; a tensor that has the size already is returned itself."""
     for axis, length in ((-1, size[0]), (-2, size[1])):
         if video.shape[axis] != length:
             video = _averaged(video, axis, length)
@@ -89,7 +89,7 @@ def _averaged(video: Tensor, axis: int, length: int) -> Tensor:
 
 
 def _covering(name: str, video: Tensor, size: Size, display: bool) -> Tensor:
-    """Frames (3, K, H, W) of one buffer, as small as just covers a size."""
+    """Downsample frames (3, K, H, W) of one buffer until they just cover a size."""
     height, width = video.shape[-2:]
     covering = covering_size((width, height), size)
     if covering == (width, height):
@@ -107,15 +107,15 @@ def _cut(video: Tensor, size: Size, corner: tuple[int, int]) -> Tensor:
 
 
 def random_start(random: np.random.Generator, side: int, crop: int) -> int:
-    """First of `crop` pixels out of `side`, a multiple of ALIGNMENT."""
+    """Random start of a crop of `crop` out of `side` pixels, a multiple of ALIGNMENT."""
     return int(random.integers((side - crop) // ALIGNMENT + 1)) * ALIGNMENT
 
 
 def sized(sample: Sample, size: Size | None, random: np.random.Generator) -> Sample:
-    """A sample whose frames cover a size, and a random window of that size out of them, alike in all buffers.
+    """Downsample a sample to just cover a size, then crop a random window of it, the same in all buffers.
 
     Args:
-        size: width and height; None leaves the sample as it is, and draws nothing.
+        size: width and height; None returns the sample as it is and draws no random number.
 
     Raises:
         TronError: the frames are smaller than the size.
@@ -135,7 +135,7 @@ def sized(sample: Sample, size: Size | None, random: np.random.Generator) -> Sam
 
 
 def centred(clip: Clip, size: Size | None) -> Clip:
-    """A clip whose frames cover a size, and the window of that size at their centre; TronError as `sized`."""
+    """Downsample a clip to just cover a size, then crop the window at its centre; TronError as `sized`."""
     if size is None:
         return clip
     width, height = covering_size((clip.meta.width, clip.meta.height), size)

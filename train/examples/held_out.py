@@ -22,18 +22,18 @@ FOREGROUND = "foreground"
 
 
 def spread(total: int, count: int) -> list[int]:
-    """Up to `count` of `total` numbers, spread evenly from the first to the last."""
+    """Up to `count` of the numbers below `total`, spread evenly from the first to the last."""
     return np.unique(np.linspace(0, total - 1, min(count, total)).round().astype(int)).tolist()
 
 
 class HeldOutClips:
-    """Clips of a split by number, decoded once where they fit in memory, else whenever they are used.
+    """Held-out clips of a split by number, decoded once if they fit in memory, else at each use.
 
     Args:
         clips: the split.
-        numbers: of its clips that are held out.
-        members: that the network sees or is judged by; the foreground comes with them.
-        budget: bytes that the decoded clips may take.
+        numbers: numbers of its held-out clips.
+        members: inputs and targets of the network; the foreground mask is read with them.
+        budget: most bytes of the decoded clips.
     """
 
     def __init__(self, clips: ClipStore, numbers: Sequence[int], members: Sequence[str], budget: float):
@@ -60,7 +60,7 @@ class HeldOutClips:
         return Clip(whole.meta, {name: images[part] for name, images in whole.frames.items()})
 
     def windows(self, number: int, stage: Stage, frames: range) -> Iterator[dict[str, Tensor]]:
-        """Frames of a clip, n windows of a stage's K, in one batch; without those that are damaged."""
+        """A clip as one batch of n windows of a stage's K frames; damaged windows are left out."""
         try:
             yield windows_of(centred(self.read(number, frames), stage.size), stage.frames)
         except TronError as error:
@@ -86,8 +86,8 @@ class HeldOutClips:
 class Windows(IterableDataset):
     """Batches {member: (B, 3, K, H, W) in [-1, 1], mask: (B, 1, K, H, W) in {0, 1}} of a stage's K and size.
 
-    A batch is of one clip and of at most `batch_pixels` pixels, but always of one window. There is no
-    length: even a process without clips must validate.
+    A batch holds windows of one clip: at most `batch_pixels` pixels, but at least one window. It defines no
+    length, because even a process without clips must validate.
     """
 
     def __init__(self, held_out: HeldOutClips, stage: Stage, batch_pixels: int):
@@ -106,7 +106,7 @@ class Windows(IterableDataset):
 
 
 def first_windows(held_out: HeldOutClips, stage: Stage, count: int) -> Iterator[dict[str, Tensor]]:
-    """First window of each of `count` clips, spread evenly over those that are held out."""
+    """First window of each of `count` clips, spread evenly over the held-out clips."""
     for place in spread(len(held_out.numbers), count):
         number = held_out.numbers[place]
         if held_out.clips.meta(number).frames >= stage.frames:

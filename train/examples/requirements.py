@@ -17,15 +17,15 @@ from tron.shards.schema import ClipMeta
 
 
 def firsts_whole(clips: ClipStore, members: Sequence[str] = ()) -> list[ClipMeta]:
-    """Metadata of the first clip of each of the splits of a store, as :func:`first_whole` finds it."""
+    """Metadata of the first undamaged clip of each split of a store, by :func:`first_whole`."""
     return [first_whole(clips, members, start) for start in clips.first_of_splits()]
 
 
 def first_whole(clips: ClipStore, members: Sequence[str] = (), start: int = 0) -> ClipMeta:
-    """Metadata of the first clip from a number on that has them, and these members in its first frame.
+    """Metadata of the first clip, from a number on, whose metadata and first frame can be read.
 
     Raises:
-        TronError: none of 64 has, all of one split; it says what is wrong with the first.
+        TronError: none of 64 clips of one split can be read; it says what is wrong with the first.
     """
     failure: TronError | None = None
     for number in range(start, min(start + MOST_TRIES, len(clips))):
@@ -44,7 +44,7 @@ def first_whole(clips: ClipStore, members: Sequence[str] = (), start: int = 0) -
 
 
 def require_members(clips: ClipStore, split: str, members: Sequence[str]) -> None:
-    """TronError, naming the buffer, unless a split holds the members that samples are to have."""
+    """Raise TronError, naming the buffer, if a split lacks a member that samples need."""
     for name in members:
         try:
             firsts_whole(clips, [name])
@@ -57,7 +57,7 @@ def require_members(clips: ClipStore, split: str, members: Sequence[str]) -> Non
 
 
 def require_clips(split: str, clips: int, processes: int) -> None:
-    """TronError where a split has fewer clips than there are processes to learn from them."""
+    """Raise TronError if a split has fewer clips than there are training processes."""
     if clips < processes:
         raise TronError(
             f"split '{split}' has {clips} clips for {processes} processes",
@@ -66,7 +66,7 @@ def require_clips(split: str, clips: int, processes: int) -> None:
 
 
 def require_fit(stage: Stage, split: str, first: ClipMeta) -> None:
-    """TronError unless a stage finds its frames and sizes in clips like the first of a split."""
+    """Raise TronError if clips like the first of a split are too short or too small for a stage."""
     if first.frames < stage.frames:
         raise TronError(
             f"stage {stage.name} needs clips of {stage.frames} frames, split '{split}' has {first.frames}",
@@ -78,7 +78,7 @@ def require_fit(stage: Stage, split: str, first: ClipMeta) -> None:
 
 
 def require_size(stage: Stage, split: str, first: ClipMeta) -> tuple[int, int]:
-    """Size of a stage's frames before its crop; TronError where a split's are smaller."""
+    """Size of a stage's frames before its crop; TronError if a split's frames are smaller."""
     if stage.size is not None:
         try:
             covering_size((first.width, first.height), stage.size)
@@ -88,7 +88,7 @@ def require_size(stage: Stage, split: str, first: ClipMeta) -> tuple[int, int]:
 
 
 def require_renderer(stage: Stage, renderer: Renderer) -> None:
-    """TronError unless a network can be trained as a stage says: its crop, size, frames and weights."""
+    """Raise TronError if a network does not fit a stage's crop, size, frames or weights."""
     block, factor = renderer.space_block, renderer.temporal_factor
     if (stage.frames - 1) % factor:
         raise TronError(
@@ -105,9 +105,9 @@ def require_renderer(stage: Stage, renderer: Renderer) -> None:
 
 
 def require_drawing(renderer: Renderer, stages: Sequence[Stage]) -> None:
-    """TronError unless a network of one's own draws what it is given: same size, finite, with gradients.
+    """Raise TronError unless a user's network gives a picture of the input's size, finite, with gradients.
 
-    Ours have their tests. It is given half grey of each stage's crop (else 64 x 64) and frames.
+    The test input is half grey, with each stage's crop (64 x 64 without one) and frames.
     """
     kind = kind_of(renderer)
     if kind in OURS:

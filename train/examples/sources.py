@@ -1,4 +1,4 @@
-"""Sources of samples: a split decoded into memory, or read frame by frame where it lies.
+"""Sources of samples: a split decoded into memory, or read frame by frame from its store.
 
 Exposure is applied when a clip is loaded, AgX after augmentation (train.examples.augmentation).
 """
@@ -24,12 +24,12 @@ from tron.shards.streaming import StreamedClips
 log = logging.getLogger(__name__)
 
 MOST_TRIES = 64
-"""Clips in a row that may be damaged before a run ends."""
+"""Most damaged clips in a row; more end the run."""
 
 
 @dataclass(frozen=True)
 class Draw:
-    """Order for one sample.
+    """Request for one sample.
 
     Attributes:
         number: of the sample within its split, counted through the stage.
@@ -51,15 +51,15 @@ class Source(Protocol):
 
 
 class Passes:
-    """Endless passes over the clips of a split, each clip once a pass, in an order of the pass's own.
+    """Endless passes over the clips of a split, each clip once per pass, newly shuffled in each.
 
-    A pass is a function of seed, split and its number alone, so that any process can say which clip is the
-    n-th. Of shards that come from their beginning to their end, blocks keep their order: the shards are
-    shuffled, and the clips within each block.
+    A pass's order depends on seed, split and pass number alone, so that any process knows the n-th clip.
+    Streamed shards are read from beginning to end: shards are shuffled, and clips within a block, but the
+    blocks of a shard keep their order.
 
     Args:
-        clips: how many there are.
-        shards: numbers of the clips of each block of each such shard; empty: any order will do.
+        clips: number of clips.
+        shards: clip numbers of each block of each streamed shard; empty: clips are shuffled freely.
     """
 
     def __init__(self, seed: int, split: str, clips: int, shards: Sequence[Sequence[range]] = ()):
@@ -83,7 +83,7 @@ class Passes:
 
 
 class ShortClip(TronError):
-    """Clip of fewer frames than a sample has: a mistake in the dataset's recipe, not damage."""
+    """A clip has fewer frames than a sample: a mistake in the dataset's recipe, not damage."""
 
 
 def _window(draw: Draw, count: int, split: str) -> slice:
@@ -95,16 +95,16 @@ def _window(draw: Draw, count: int, split: str) -> slice:
 
 
 class IndexedSplit:
-    """A split on a disk, in a store or in a stream, of which each sample reads its own frames.
+    """A split on a disk, in a store or in a stream; each sample reads only its own frames.
 
-    Sample number n is of clip n of the split's passes. Where that clip's frames are damaged, those of clip
-    n + 1, n + 2, ... stand in, so that which samples there are follows from the data alone; the log names
-    each damaged clip once.
+    Sample n comes from clip n of the split's passes. If that clip's frames are damaged, clip n + 1, n + 2,
+    ... takes its place, so that the samples follow from the data alone; the log names each damaged clip
+    once.
 
     Args:
         clips: of the split. split: its name in this run. members: that samples have. seed: of the run.
-        mix_lights: share of the samples that show their scene under two of its lights
-        (train.examples.sources).
+        mix_lights: share of the samples that show their scene under a mixture of two of its lights
+        (:class:`OtherLights`).
     """
 
     def __init__(
@@ -120,7 +120,7 @@ class IndexedSplit:
         """Frames of clip `draw.number` of the passes, from a random start.
 
         Raises:
-            TronError: a clip is too short; or no clip of the next 64, or of a whole pass, is whole.
+            TronError: a clip is too short; or the next 64 clips, or all of a pass, are damaged.
         """
         failure: TronError | None = None
         for ahead in range(min(MOST_TRIES, len(self.clips))):
@@ -158,7 +158,7 @@ class IndexedSplit:
 
 
 class CachedSplit(IndexedSplit):
-    """A split decoded into memory: IndexedSplit's samples, bit by bit. Damaged clips are left where they lie.
+    """A split decoded into memory, with exactly IndexedSplit's samples. Damaged clips are not decoded.
 
     Args:
         clips, split, members, seed, mix_lights: as IndexedSplit's.
@@ -186,7 +186,7 @@ class CachedSplit(IndexedSplit):
     def _whole(self, number: int) -> Sample | None:
         try:
             return Sample.of(self.clips.read_frames(number, members=self.members))
-        except TronError:  # perhaps of one frame: the samples of the others are whole
+        except TronError:  # perhaps one frame is damaged: samples of the others are whole
             return None
 
 
@@ -208,12 +208,12 @@ class OtherLights:
             self._places[self._place(number)].append(number)
 
     def mixed(self, sample: Sample, number: int, window: slice, random: np.random.Generator) -> Sample:
-        """A clip's frames, in `ratio` of all cases with those under another of its lights in a random share.
+        """Return a clip's frames; with probability `ratio`, blend in the frames under another light.
 
-        Every buffer becomes w of this light's and 1 - w of the other's, w uniform in [0, 1], both under their
-        own exposure: under either, an upward-facing white plane without anything in the way has one radiance
-        (conventions.md, 5), and so it has under their mixture. Samples with display members, clips
-        without another light, and those whose frames have other cameras stay as they are.
+        Every buffer becomes w times this light's plus 1 - w times the other's, w uniform in [0, 1], each with
+        its own exposure. Exposure gives an unoccluded upward-facing white plane the same radiance under each
+        light (conventions.md, 5), and so under the mixture. Samples with display members, clips without
+        another light, and clips whose frames have other cameras stay as they are.
         """
         if sample.display or random.random() >= self.ratio:
             return sample
@@ -234,6 +234,6 @@ class OtherLights:
         return Sample(buffers)
 
     def _place(self, number: int) -> tuple[str, str]:
-        """A clip's split, whose clips alone are seen from the same places, and its key without its light."""
+        """A clip's split and its key without the light; only clips of one split share cameras."""
         key = re.sub(r"-[^-]+(-c\d+)?$", r"\1", self.clips.key(number))
         return self.clips.split_of(number), key

@@ -1,4 +1,4 @@
-"""Splits of a training run by name: of its dataset, or of another dataset's folder."""
+"""Splits of a training run by name, from its dataset or from another dataset's folder."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Splits:
         elsewhere: name of a split -> FOLDER or FOLDER#SPLIT where it is read from.
 
     Raises:
-        TronError: a folder is no dataset, or has not the split that is to come from it.
+        TronError: a folder is no dataset, or lacks the split to be read from it.
     """
 
     def __init__(self, dataset: Place, elsewhere: Mapping[str, str] | None = None) -> None:
@@ -41,7 +41,7 @@ class Splits:
         return sorted({*self._places, *self._manifests[str(self._dataset)].splits()})
 
     def clips(self, name: str) -> ClipStore:
-        """Clips of a split; TronError, naming those there are, where there is none."""
+        """Clips of a split; if it does not exist, TronError names the existing splits."""
         if name not in self._stores:
             place = self._places.get(name, SplitPlace(str(self._dataset), (name,)))
             try:
@@ -53,11 +53,11 @@ class Splits:
 
 
 def manifest_hash(folder: Place) -> str:
-    """SHA-256 of a dataset's manifest, which names the hash of each of its shards, hexadecimal."""
+    """Hexadecimal SHA-256 of a dataset's manifest, which holds the hashes of all its shards."""
     return hashlib.sha256(manifest_bytes(folder)).hexdigest()
 
 
 def split_hashes(elsewhere: Mapping[str, str]) -> dict[str, str]:
-    """Of each split that is read elsewhere, its dataset's `manifest_hash` and its name there."""
+    """For each split of another dataset: that dataset's `manifest_hash` and the split's name in it."""
     places = {name: SplitPlace.parse(name, value) for name, value in elsewhere.items()}
     return {name: f"{manifest_hash(place.folder)}#{'+'.join(place.splits)}" for name, place in places.items()}

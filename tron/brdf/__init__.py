@@ -1,5 +1,5 @@
-"""The material of every surface: glTF's metallic-roughness, which keeps all light that it does not absorb.
+"""The material of every surface: glTF's metallic-roughness, made energy-conserving.
 
-One definition for the path tracer (:mod:`tron.brdf.bsdf`), and for surfels, bounces, bakes and fits, which
-know its shares of light (:mod:`tron.brdf.reflectance`).
+One definition serves the path tracer (:mod:`tron.brdf.bsdf`), and surfels, bounces, bakes and fits, which use
+its albedos (:mod:`tron.brdf.reflectance`).
 """

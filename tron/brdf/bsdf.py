@@ -1,11 +1,11 @@
-"""The material as a BSDF of Mitsuba, ``metallicroughness``: what the path tracer's truth is made of.
+"""The material as a Mitsuba BSDF, ``metallicroughness``, with which ground truth is path-traced.
 
     f = body / pi + D(h) G_2(v, l) / (4 n.v n.l) F
     F = (1 - metallic) g_glass F_glass(v.h) + metallic g_metal F_metal(v.h)
 
 with :mod:`tron.brdf.microfacets`, Schlick's Fresnel of base color for metal and Fresnel's own equations for
-the dielectric of index 1.5; body and the factors g are those of :class:`tron.brdf.reflectance.Layers`. In
-Mitsuba's place stood ``principled``, which loses up to two thirds of the light on rough metal.
+the dielectric of index 1.5; body and the factors g come from :class:`tron.brdf.reflectance.Layers`.
+Mitsuba's own ``principled`` would lose up to two thirds of the light on rough metal.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportReturnType=false
@@ -25,9 +25,9 @@ from tron.brdf.table import BrdfTable
 NAME = "metallicroughness"
 INPUTS = ("base_color", "roughness", "metallic")
 LEAST_ALPHA = 1e-3
-"""Of the distribution, as ``principled`` has it: narrower lobes are beyond float32."""
+"""Least alpha of the distribution, as in ``principled``: narrower lobes exceed float32."""
 _LEAST_SHARE = 0.1
-"""Of the samples that either part gets where both are there."""
+"""Least share of the samples for either part, if both are present."""
 
 
 def metallic_roughness(base_color: Any, roughness: Any, metallic: Any) -> mi.BSDF:
@@ -35,7 +35,7 @@ def metallic_roughness(base_color: Any, roughness: Any, metallic: Any) -> mi.BSD
 
     Args:
         base_color: linear RGB in [0, 1]: a number, a texture or its dictionary.
-        roughness, metallic: in [0, 1], likewise.
+        roughness, metallic: in [0, 1]: a number, a texture or its dictionary.
     """
     register_bsdf()
     properties = {"base_color": base_color, "roughness": roughness, "metallic": metallic}
@@ -45,7 +45,7 @@ def metallic_roughness(base_color: Any, roughness: Any, metallic: Any) -> mi.BSD
 
 
 def register_bsdf() -> None:
-    """Make ``metallicroughness`` known to the variant in use, as a plugin of Mitsuba's."""
+    """Register the Mitsuba plugin ``metallicroughness`` for the active variant."""
     _registered(str(mi.variant()))
 
 
@@ -62,7 +62,7 @@ def _alpha(material: Material) -> mi.Float:
 
 @cache
 def _registered(_variant: str) -> None:
-    """A class has to be made under the variant that it is of."""
+    """Make the class under the active variant, whose base class it needs."""
 
     class MetallicRoughness(mi.BSDF):
         """Inputs, textures or numbers: base_color (0.5), roughness (0.5), metallic (0)."""
@@ -90,7 +90,7 @@ def _registered(_variant: str) -> None:
             )
 
         def glossy_share(self, layers: Layers) -> mi.Float:
-            """Of the samples, by what either part sends out."""
+            """Share of the samples for the glossy part, by the parts' albedos."""
             glossy, diffuse = mi.luminance(layers.specular), mi.luminance(layers.body)
             share = glossy / dr.maximum(glossy + diffuse, 1e-4)
             share = dr.clip(share, _LEAST_SHARE, 1 - _LEAST_SHARE)
@@ -99,7 +99,7 @@ def _registered(_variant: str) -> None:
         def value_and_density(
             self, material: Material, layers: Layers, wi: mi.Vector3f, wo: mi.Vector3f
         ) -> tuple[mi.Color3f, mi.Float]:
-            """f n.l and the density of :meth:`sample`, of directions above the surface."""
+            """f n.l and the density of :meth:`sample`, for directions above the surface."""
             alpha, half = _alpha(material), dr.normalize(wi + wo)
             mirrored = fresnel(material, dr.dot(wi, half), layers=layers)
             glossy, diffuse = seen_density(wi.z, half, alpha), dr.inv_pi * wo.z

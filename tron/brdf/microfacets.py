@@ -1,11 +1,11 @@
-"""GGX, the distribution of microfacets: normals that a view sees, and what hides them; local, n is z.
+"""The GGX microfacet distribution: visible normals, masking and shadowing; in the local frame, n is z.
 
     D(h) = a^2 / (pi (h_z^2 (a^2 - 1) + 1)^2)               a = roughness^2
     G_1(v) = 2 v_z / (v_z + s(v))                            s(v) = sqrt(a^2 + (1 - a^2) v_z^2)
     G_2(v, l) = 2 v_z l_z / (l_z s(v) + v_z s(l))            heights correlated
 
-(Walter et al. 2007; Heitz 2014, "Understanding the masking-shadowing function", eq. 99), as glTF and Cycles
-have it; Mitsuba's materials multiply G_1(v) and G_1(l), which hides facets of like height twice.
+(Walter et al. 2007; Heitz 2014, "Understanding the masking-shadowing function", eq. 99), as in glTF and
+Cycles; Mitsuba's materials multiply G_1(v) and G_1(l), which counts the masking of equally high facets twice.
 """
 
 from __future__ import annotations
@@ -15,7 +15,7 @@ import mitsuba as mi
 
 
 def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vector3f:
-    """Half vector by the GGX normals that ``view`` sees, both unit and local; Heitz 2018, listing 1."""
+    """Half vector sampled from the GGX normals visible to ``view``, both unit and local (Heitz 2018)."""
     stretched = dr.normalize(mi.Vector3f(alpha * view.x, alpha * view.y, view.z))
     length2 = dr.square(stretched.x) + dr.square(stretched.y)
     aslant = length2 > 1e-12
@@ -33,7 +33,7 @@ def visible_normal(view: mi.Vector3f, alpha: mi.Float, u: mi.Point2f) -> mi.Vect
 
 
 def seen_density(view: mi.Float, half: mi.Vector3f, alpha: mi.Float) -> mi.Float:
-    """Density by solid angle of directions that :func:`visible_normal` mirrors, D G_1(v) / (4 v_z).
+    """Solid-angle density of ``view`` mirrored at a :func:`visible_normal`, D G_1(v) / (4 v_z).
 
     Args:
         view: its cosine to the normal, above 0.
@@ -46,13 +46,13 @@ def seen_density(view: mi.Float, half: mi.Vector3f, alpha: mi.Float) -> mi.Float
 def distribution(half: mi.Vector3f, alpha: mi.Float) -> mi.Float:
     """D at a half vector."""
     alpha2 = dr.square(alpha)
-    # By its sine: 1 less the cosine's square has no digits left where a lobe is narrow.
+    # By the sine: 1 minus the squared cosine loses all digits where a lobe is narrow.
     spread = alpha2 * dr.square(half.z) + dr.square(half.x) + dr.square(half.y)
     return alpha2 / (dr.pi * dr.square(spread))
 
 
 def unhidden(view: mi.Float, out: mi.Float, alpha: mi.Float) -> mi.Float:
-    """G_2 / G_1(v): share of the light towards ``out`` that no other facet stops; cosines, above 0."""
+    """G_2 / G_1(v): share of the light towards ``out`` not blocked by other facets; cosines, above 0."""
     at_view, at_out = _slope(view, alpha), _slope(out, alpha)
     return out * (view + at_view) / (out * at_view + view * at_out)
 

@@ -1,18 +1,18 @@
-"""Reflectance of a material: the share of uniform light that its diffuse part and its lobe send on.
+"""Reflectance of a material: the share of uniform light that its diffuse part and its lobe reflect.
 
                 "conserving", the data engine's                         "lambert", the paper's
     specular    (1 - metallic) G g(F_glass) + metallic S g(F_base)      F0 A + B
     diffuse     base (1 - metallic) (1 - G g(F_glass))                  base (1 - metallic)
 
-F0 is 0.04 (1 - metallic) + metallic base, S = base A + B; A, B, G and E are those of :mod:`tron.brdf.table`.
-A lobe of single reflections loses the light that meets a second facet: white metal of roughness 1 would send
-out less than half of what arrives. That light is given back in the lobe's own shape,
+F0 is 0.04 (1 - metallic) + metallic base, S = base A + B; A, B, G and E come from :mod:`tron.brdf.table`.
+A lobe of single reflections loses the light that meets a second facet: white metal of roughness 1 would
+reflect less than half of the light. The lost light is added back in the lobe's own shape,
 
     g(F) = 1 + (1 - e) / e  F E / (1 - F (1 - E))       e = A + B at the angle of view, F the mean Fresnel
 
 (Turquin 2019, "Practical multiple scattering compensation for microfacet models"; F's part by Kulla and Conty
-2017), as Cycles has it. Diffuse gets what the lobe leaves. So white sends out all that arrives, at every
-roughness and angle. Below a lobe the diffuse part is not reciprocal: it knows the angle of view alone.
+2017), as in Cycles. The diffuse part gets the light that the lobe leaves, so white reflects all light at
+every roughness and angle. Under a lobe it is not reciprocal, because it depends on the angle of view alone.
 """
 
 from __future__ import annotations
@@ -30,20 +30,20 @@ from tron.estimation import Brdf
 
 DIELECTRIC_F0 = 0.04
 MOST_ALBEDO = 0.99
-"""Largest albedo of a bounce: light dies out."""
+"""Largest albedo of a bounce, so that light dies out."""
 MOST_FRESNEL = 1.001
-"""Of base colors beyond 1, which a float image may hold: a little above 1, where white has its derivative."""
+"""Largest F, for float images with base colors above 1; it exceeds 1, so that white keeps its derivative."""
 LEAST_F0 = 1e-3
-"""Of a lobe whose mean direction is asked for: black metal has one too."""
+"""Least F0 for a lobe's mean direction, so that black metal has one too."""
 LEAST_ALBEDO = 1e-3
-"""Of the table's e, before it is divided by: at grazing angles a rough lobe has none."""
+"""Least value of the table's e, by which is divided: a rough lobe has none at grazing angles."""
 
 
 Array = TypeVar("Array")
 
 
 class Material(Protocol):
-    """Base color, linear, roughness and metallic, in [0, 1]; of any number of lanes."""
+    """Linear base color, roughness and metallic, in [0, 1]; any number of lanes."""
 
     base_color: mi.Color3f
     roughness: mi.Float
@@ -70,8 +70,8 @@ class Layers:
     Attributes:
         body: mi.Color3f, the diffuse part's albedo.
         glass: factor g on the dielectric's lobe.
-        metal: mi.Color3f, that on the metal's.
-        specular: mi.Color3f, albedo of both lobes, by their shares.
+        metal: mi.Color3f, factor g on the metal's lobe.
+        specular: mi.Color3f, albedo of both lobes, weighted by metallic.
     """
 
     body: mi.Color3f
@@ -81,7 +81,7 @@ class Layers:
 
     @classmethod
     def of(cls, material: Material, table: BrdfTable, cosine: mi.Float | None = None) -> Layers:
-        """Arguments as of :func:`reflectance`."""
+        """Arguments as in :func:`reflectance`."""
         scale, bias, glass, whole = table(material.roughness, cosine)
         single = dr.maximum(scale + bias, LEAST_ALBEDO)
         of_glass = compensation(mi.Float(glass_fresnel()), single, whole)
@@ -96,7 +96,7 @@ class Layers:
 
 
 def compensation(fresnel: Array, single: Any, whole: Any) -> Array:
-    """Factor g on a lobe that gives back the light which meets further facets; NumPy and Dr.Jit alike.
+    """Factor g on a lobe that adds multiple scattering between facets; NumPy and Dr.Jit alike.
 
     Args:
         fresnel: F, its mean over cosine-distributed directions, in [0, 1].
@@ -130,7 +130,7 @@ def reflectance(
     Args:
         material: such as a :class:`tron.tracing.Surface`.
         table: of the active variant.
-        cosine: n.v; None: the mean over all directions of view, by the cosine, as of light that bounces.
+        cosine: n.v; None: the cosine-weighted mean over all views, as for bounced light.
         brdf: the model.
     """
     if brdf == "lambert":
@@ -145,7 +145,7 @@ def fresnel(
 ) -> mi.Color3f:
     """Share that one facet mirrors at ``cosine`` to the half vector; its mean over a lobe is in ``table``.
 
-    With ``layers`` each lobe's has its factor g.
+    With ``layers``, each lobe's share is multiplied by its factor g.
     """
     weight = (1 - dr.clip(cosine, 0, 1)) ** 5
     if brdf == "lambert":
@@ -159,12 +159,12 @@ def fresnel(
 def lobe_parts(
     material: Material, table: BrdfTable, normal: mi.Vector3f, to_camera: mi.Vector3f
 ) -> list[tuple[mi.Float, mi.Vector3f]]:
-    """Parts of a lobe: share of its light, and the mean of the directions, world, that it comes from.
+    """Parts of a lobe: for each its share of the light and its mean direction, world. Shares sum to 1.
 
-    A mean is the shorter the wider its part (:mod:`tron.brdf.table`). Shares sum to 1.
+    The wider a part, the shorter its mean direction (:mod:`tron.brdf.table`).
 
     Args:
-        material, table: as of :func:`reflectance`.
+        material, table: as in :func:`reflectance`.
         normal, to_camera: unit, world.
     """
     normal, to_camera = mi.Vector3f(normal), mi.Vector3f(to_camera)
@@ -172,7 +172,7 @@ def lobe_parts(
     f0 = dr.lerp(DIELECTRIC_F0, mi.luminance(material.base_color), material.metallic)
     f0 = dr.maximum(f0, LEAST_F0)
     along, (share, apart, longer) = table.lobe(material.roughness, cosine, f0)
-    # A normal that is seen from behind mirrors away from the surface too.
+    # A normal seen from behind also mirrors away from the surface.
     mirrored = (cosine + dr.abs(cosine)) * normal - to_camera
     mean = along.x * mirrored + along.y * normal
     length2 = dr.squared_norm(mean)
@@ -187,9 +187,9 @@ def _f0(material: Material) -> mi.Color3f:
 
 
 def bounce_albedo(material: Material, table: BrdfTable, brdf: Brdf = "conserving") -> mi.Color3f:
-    """Share of evenly arriving light that leaves a surface again, its lobe included, by channel.
+    """Share of uniform light that a surface reflects, its lobe included, by channel.
 
-    At most ``MOST_ALBEDO``; differentiable. Arguments as of :func:`reflectance`.
+    At most ``MOST_ALBEDO``; differentiable. Arguments as in :func:`reflectance`.
     """
     share = reflectance(material, table, brdf=brdf)
     return dr.minimum(share.diffuse + share.specular, MOST_ALBEDO)

@@ -1,17 +1,17 @@
-"""Shares of light that microfacets mirror, by roughness and n.v, integrated over all directions.
+"""Albedo and mean direction of GGX lobes, by roughness and n.v, integrated over all directions.
 
     A, B    of F0 A + B, the albedo of a GGX mirror with Schlick's Fresnel: the split sum (Karis 2013)
     G       albedo of the same mirror on glass of index 1.5, whose F0 is 0.04, with Fresnel's own equations
     E       A + B, the albedo of a perfect mirror, averaged over cosine-distributed n.v
-    R, N    of F0 (R_A, N_A) + (R_B, N_B), the same integral of the directions themselves: along the mirror's
-            direction, and along the normal besides. Over the albedo it is the lobe's mean direction, the
-            shorter the wider the lobe. A mirror has none along the normal, whatever the angle
+    R, N    of F0 (R_A, N_A) + (R_B, N_B), the same integral of the directions: their components along the
+            mirror's direction and along the normal. Divided by the albedo it is the lobe's mean direction,
+            which is shorter for wider lobes. A smooth mirror's N is 0 at every angle
 
-A lobe that is seen aslant is long and narrow. Two round ones stand for it, whose means are the lobe's
-together; ``lobe_parts.npy`` says how far apart they are, fitted to the integral by ``dev/lobe_parts.py``.
+A lobe seen at a grazing angle is long and narrow. It is replaced by two round lobes with the same total mean;
+``lobe_parts.npy`` holds their distance, fitted to the integral by ``dev/lobe_parts.py``.
 
-Light that meets one facet is counted alone; :mod:`tron.brdf.reflectance` gives the rest back. G is above
-0.04 A + B by up to 0.02: Schlick's Fresnel is 0.07 at 60 degrees, where glass mirrors 0.09.
+Only single scattering is counted; :mod:`tron.brdf.reflectance` adds the rest. G exceeds 0.04 A + B by up to
+0.02: Schlick's Fresnel is 0.07 at 60 degrees, where glass mirrors 0.09.
 """
 
 from __future__ import annotations
@@ -32,14 +32,14 @@ GLASS_INDEX = 1.5
 TABLE_FILE = Path(__file__).with_name("albedos.npy")
 PARTS_FILE = Path(__file__).with_name("lobe_parts.npy")
 PARTS_F0, PARTS_SMOOTHEST = 0.04, 0.2
-"""Lower of the two F0 that the file has, the other is 1, and its least roughness: below, lobes are alike."""
+"""The lower F0 of the file (the other is 1), and its least roughness, below which lobes are alike."""
 
 
 @cache
 def brdf_table() -> np.ndarray:
-    """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), R_A, N_A, R_B, N_B. Once a process.
+    """(roughness, n.v, 8) float32: A, B, G, E (the same for every n.v), R_A, N_A, R_B, N_B; read once.
 
-    Entry (i, j) is of roughness i / 255 and n.v = (j + 1/2) / 256; as ``dev/brdf_table.py`` integrated them.
+    Entry (i, j) has roughness i / 255 and n.v = (j + 1/2) / 256, as integrated by ``dev/brdf_table.py``.
     """
     table = np.load(TABLE_FILE)
     whole = np.average(table[..., 0] + table[..., 1], axis=1, weights=_CENTRES)
@@ -52,10 +52,10 @@ _CENTRES = (np.arange(TABLE_SIZE) + 0.5) / TABLE_SIZE
 
 @cache
 def parts_table() -> np.ndarray:
-    """(2, roughness, n.v, 4) float32: w, x, y, 0 of F0 0.04 and of F0 1; entries as of :func:`brdf_table`.
+    """(2, roughness, n.v, 4) float32: w, x, y, 0 for F0 0.04 and F0 1; entries as in :func:`brdf_table`.
 
-    w is the first part's share of the light. With the mean m of the lobe, its unit vector u and s^2 = 1 -
-    |m|^2 its own mean is m + d, d = x s (n - (n.u) u) + y s^2 u, and the other's m - w / (1 - w) d.
+    w is the first part's share of the light. With the lobe's mean m, its unit vector u and s^2 = 1 - |m|^2,
+    the first part's mean is m + d, d = x s (n - (n.u) u) + y s^2 u, and the second's m - w / (1 - w) d.
     """
     fitted = np.load(PARTS_FILE)
     rows, columns = fitted.shape[1:3]
@@ -75,7 +75,7 @@ class BrdfTable:
 
     Attributes:
         texels: A, B, G and E, row-major.
-        means: the same of each roughness, averaged over cosine-distributed n.v.
+        means: A, B, G and E of each roughness, averaged over cosine-distributed n.v.
         directions: R_A, N_A, R_B and N_B, row-major.
         glass_parts, mirror_parts: :func:`parts_table`, row-major.
     """
@@ -88,7 +88,7 @@ class BrdfTable:
 
     @classmethod
     def load(cls) -> BrdfTable:
-        """The table for the active variant; one for all who ask."""
+        """The table for the active variant, loaded once."""
         return _loaded(str(mi.variant()))
 
     def __call__(self, roughness: mi.Float, cosine: mi.Float | None = None) -> mi.Vector4f:
@@ -105,15 +105,15 @@ class BrdfTable:
         return dr.lerp(upper, lower, fy)
 
     def lobe(self, roughness: mi.Float, cosine: mi.Float, f0: mi.Float) -> tuple[mi.Vector2f, mi.Vector3f]:
-        """Where a lobe's light comes from.
+        """Mean direction and parts of a lobe.
 
         Args:
-            roughness, cosine: as of :meth:`__call__`.
+            roughness, cosine: as in :meth:`__call__`.
             f0: reflectance at the normal, above 0.
 
-        Returns: the mean of its directions as factors on the mirror's direction and on the normal, both unit,
-        1 and 0 of a mirror; and w, x and y of :func:`parts_table`, between whose two F0 lobes are mixed as
-        their Fresnel is.
+        Returns: the mean direction as factors on the mirror's direction and on the normal, both unit (1 and 0
+        for a smooth mirror); and w, x and y of :func:`parts_table`, interpolated between its two F0 as
+        Fresnel is.
         """
         scale, bias, _, _ = self(roughness, cosine)
         whole = dr.rcp(f0 * scale + bias)
@@ -148,7 +148,7 @@ def _looked_up(texels: mi.Float, roughness: mi.Float, cosine: mi.Float) -> mi.Ve
 
 
 def _between(x: mi.Float) -> tuple[mi.UInt32, mi.Float]:
-    """The entry below place ``x``, and how far beyond it ``x`` is; ends are held."""
+    """The entry below ``x`` and the fraction beyond it; clamped at the ends."""
     x = dr.clip(x, 0, TABLE_SIZE - 1)
     entry = dr.minimum(mi.UInt32(x), TABLE_SIZE - 2)
     return entry, x - mi.Float(entry)

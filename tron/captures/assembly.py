@@ -1,4 +1,4 @@
-"""From what a file says of its photos to a capture: what cannot be used is left out, counted and named."""
+"""Assemble a capture from a file's photos: unusable ones are left out, counted and named."""
 
 from __future__ import annotations
 

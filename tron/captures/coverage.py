@@ -1,4 +1,4 @@
-"""From how far around a capture shows what it looks at."""
+"""How far around its subject a capture's cameras reach."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""One door for every kind of capture, and the table of the formats it knows."""
+"""Loading of every kind of capture, and the table of known formats."""
 
 from __future__ import annotations
 
@@ -114,7 +114,7 @@ class CaptureSettings(FrameSettings, MatchingSettings, TensoirSettings, PhotoSet
 
 
 class LoadSettings(CaptureSettings, PosingSettings):
-    """All that :func:`load_capture` can be told: what users say, and what the calling program knows."""
+    """All options of :func:`load_capture`: the users' choices and the calling program's."""
 
     cache_bytes: int = Field(default=1_000_000_000, ge=0, description="decoded image data kept in memory")
 

@@ -78,7 +78,7 @@ class _Placing(Part):
 
 
 class Remove(_Selecting):
-    """Take surfels out of the scene."""
+    """Remove surfels from the scene."""
 
     action: Literal["remove"] = "remove"
 
@@ -256,7 +256,7 @@ class Material(_Selecting):
         return self
 
     def apply(self, scene: GaussianScene, views: Views) -> GaussianScene:
-        """The scene with them made of other stuff; nothing of it moves."""
+        """The scene with their materials changed; nothing moves."""
         which, changed = self.selected(scene, views), {}
         for name in ("base_color", "emission", "roughness", "metallic"):
             change = getattr(self, name)

@@ -1,7 +1,7 @@
 """Objects that fall, are pushed and collide: MuJoCo on the convex hulls of their surfels.
 
-All that stands still is one height field: its highest surfels below the top of what moves, so that a table
-carries, a wall stops and a ceiling is no floor. Where nothing stands, things fall out of the scene. Lengths
+All static surfels form one height field: the highest ones below the top of the moving objects, so that tables
+carry, walls stop and a ceiling is no floor. Where it is empty, objects fall out of the scene. Lengths
 within are in typical radii of the bodies, whatever the scene's unit is, since contacts are tuned for those.
 The same scene gives the same motion on one machine; no bits are promised across machines.
 """

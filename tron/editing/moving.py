@@ -76,7 +76,7 @@ class MovingScene:
         return [moving.get(mesh) for mesh in range(count)]
 
     def follow(self, surfels: GaussianScene, seconds: float) -> GaussianScene:
-        """Other surfels of the same things, such as a proxy: each moves as the nearest one of the scene."""
+        """Move other surfels of the same objects, such as a proxy: each follows the nearest of the scene."""
         if id(surfels) not in self._nearest:
             _, nearest = KDTree(self.scene.means).query(surfels.means)
             self._nearest[id(surfels)] = self.which[nearest]

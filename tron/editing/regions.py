@@ -1,4 +1,4 @@
-"""Regions of a scene, found along its surface: from a few surfels on, over neighbours that are alike.
+"""Regions of a scene, grown along its surface from a few surfels over similar neighbours.
 
 A graph joins each surfel to its nearest neighbours. :func:`grown` takes what hangs together with the seeds
 over small steps; :func:`parted` lets clicks inside and outside compete: every surfel goes to the seed that is

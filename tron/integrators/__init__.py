@@ -1,4 +1,4 @@
-"""The tracer and its light as Mitsuba integrators, for those whose cameras and films are Mitsuba's.
+"""The tracer and its shading as Mitsuba integrators, for use with Mitsuba's cameras and films.
 
     from tron.integrators import register
     from tron.runtime import activate
@@ -13,18 +13,18 @@
     })
     image = mi.render(scene, spp=16)
 
-Surfels come from a file (``filename``) or from memory (``surfels``, of :func:`embed`). They are all that is
-seen: shapes of the Mitsuba scene are not. Rays go where Mitsuba's sensor and sampler send them, and the
-film's filter makes pixels of what they show. Perspective, thin-lens and orthographic sensors are tested;
-those that place rays by the bounds of the scene's shapes, such as ``distant``, see nothing. All rays of a
-render are traced at once, so memory grows with pixels x samples. Plugins:
+Surfels come from a file (``filename``) or from memory (``surfels``, by :func:`embed`). Only surfels are seen,
+not the shapes of the Mitsuba scene. Mitsuba's sensor and sampler generate the rays, and the film's filter
+turns their colours into pixels. Perspective, thin-lens and orthographic sensors are tested; sensors that
+place rays by the bounds of the scene's shapes, such as ``distant``, see nothing. All rays of a render are
+traced at once, so memory grows with pixels x samples. Plugins:
 
-``tron_gbuffer`` (:mod:`tron.integrators.gbuffer`): what the surfels are, their harmonics' radiance included.
-``tron_guidance`` (:mod:`tron.integrators.guidance`): what they look like under an environment.
+``tron_gbuffer`` (:mod:`tron.integrators.gbuffer`): the surfels' G-buffer, with the radiance of harmonics.
+``tron_guidance`` (:mod:`tron.integrators.guidance`): the surfels shaded under an environment.
 ``tron_many_lights`` (:mod:`tron.integrators.many_lights`): no surfels, but the Mitsuba scene's own shapes,
 path-traced under many environments at once.
 
-Mitsuba wraps what a plugin raises in a RuntimeError of its own; the last line of its message is TRON's.
+Mitsuba wraps a plugin's errors in its own RuntimeError; the last line of the message is TRON's.
 """
 
 from tron.integrators.plugin import embed
@@ -35,10 +35,10 @@ VARIANTS = ("llvm_ad_rgb", "cuda_ad_rgb")
 
 
 def register() -> None:
-    """Make the plugins known to Mitsuba for the active variant; safe to repeat, and due again after a change.
+    """Register the plugins for the active Mitsuba variant; safe to repeat, needed again after a change of it.
 
     Raises:
-        TronError: no variant is set, or one that the tracer does not run in.
+        TronError: no variant is set, or the tracer does not support it.
     """
     import mitsuba as mi
 

@@ -1,11 +1,11 @@
-"""``tron_gbuffer``: what the surfels are along each ray of a sensor.
+"""``tron_gbuffer``: the surfels' G-buffer along each ray of a sensor.
 
     property       type      meaning
     filename       string    the surfels: a PLY of TRON, 2DGS or 3DGS
     surfels        object    or a scene from memory: tron.integrators.embed(scene)
 
-Main channels: radiance of the surfels' harmonics, display space, premultiplied by opacity, which is alpha.
-Others, named as Mitsuba's ``aov`` integrator names its own, 0 where there is no surfel:
+Main channels: radiance of the surfels' harmonics, display space, premultiplied by alpha, the opacity.
+Other channels, in the style of Mitsuba's ``aov`` integrator, 0 where there is no surfel:
 
     position.X .Y .Z     world
     depth.T              distance along the ray from the near plane to the median hit, 0 where there is none
@@ -13,12 +13,12 @@ Others, named as Mitsuba's ``aov`` integrator names its own, 0 where there is no
     base_color.R .G .B   linear
     roughness.Y  metallic.Y  opacity.Y
 
-A pixel is the film's filtered mean of these over its rays. For rays through pixel centres alone take a box
-filter and the sampler ``{"type": "stratified", "jitter": False, "sample_count": 1}``. A ray begins on the
-near plane of its sensor, and surfels in front of it are not seen; the far plane is ignored.
+A pixel is the film's filtered mean of these over its rays. For rays through pixel centres only, use a box
+filter and the sampler ``{"type": "stratified", "jitter": False, "sample_count": 1}``. A ray begins on its
+sensor's near plane, and nearer surfels are not seen; the far plane is ignored.
 
-``mi.traverse(integrator)`` exposes the parameters of the surfels. All of them are differentiable by
-``mi.render``, as :class:`tron.tracing.SurfelTracer` is: visibility is not.
+``mi.traverse(integrator)`` exposes the parameters of the surfels. All are differentiable through
+``mi.render``, like :class:`tron.tracing.SurfelTracer`; visibility is not differentiated.
 """
 
 from __future__ import annotations

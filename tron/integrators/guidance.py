@@ -1,29 +1,29 @@
-"""``tron_guidance``: what the surfels look like under an environment, along each ray of a sensor.
+"""``tron_guidance``: surfels shaded under an environment, along each ray of a sensor.
 
     property            type      meaning
-    filename, surfels             as of tron_gbuffer
+    filename, surfels             as in tron_gbuffer
     environment         string    the light: a lat-long .hdr or .exr in TRON's orientation (up is +z)
                         object    or from memory: tron.integrators.embed(environment_map)
-                                  without either, the Mitsuba scene's own environment emitter
+                                  if absent, the Mitsuba scene's own environment emitter
     buffer              string    pbr (default), irradiance, unshadowed, shadowed, indirect or lit
-    shadow_rays         integer   for each camera ray, even (default: 64); of many camera rays per pixel, each
-                                  may have fewer: 2 lighten shadows by a hundredth or two, 8 by nothing
+    shadow_rays         integer   per camera ray, even (default: 64); with many camera rays per pixel fewer
+                                  suffice: 2 lighten shadows by 1 to 2 %, 8 not at all
     estimator           string    ratio (default) or plain: see tron.estimation
     two_sided           boolean   back faces block shadow rays beyond two spacings (default: true)
-    bounces             integer   times that light bounces between surfels (default: 4; 0: never)
-    reflections         integer   for each camera ray, rays that find what glossy surfaces mirror (default: 0)
+    bounces             integer   bounces of light between surfels (default: 4; 0: none)
+    reflections         integer   reflection rays of glossy surfaces per camera ray (default: 0)
     brdf                string    material: conserving (default), which loses no light, or lambert
     cubemap_resolution  integer   of the prefiltered environment
 
 Buffers are those of :mod:`tron.shading.guidance`: linear, in front of the environment, which is not seen
-through opaque surfels; alpha is opacity. Those that are not the main channels follow as ``irradiance.R`` and
+through opaque surfels; alpha is opacity. The other buffers follow the main channels as ``irradiance.R`` and
 so on, then ``opacity.Y``.
 
-What surfels see of one another is traced once, and again when they have moved; light is baked on them once,
-and again when it has changed.
+Visibility between surfels is traced once, and again when they have moved; light is baked on them once, and
+again when it has changed.
 
-Gradients reach the surfels through what camera rays see, as shading has it, and the materials of all of them
-through the light that bounces; what shadow and reflection rays find is a constant, and so is direct light.
+Gradients reach the surfels that camera rays see through shading, and the materials of all surfels through
+bounced light. The results of shadow and reflection rays are constants, and so is direct light.
 """
 
 from __future__ import annotations
@@ -48,12 +48,12 @@ from tron.tracing import GBuffer
 BUFFERS = tuple(name for name in Guidance.BUFFERS if name != "mask")
 CHOICES = {"estimator": Estimator, "brdf": Brdf}
 NUMBERS = {"bounces": (0, 16), "reflections": (0, 1024)}
-"""Least and greatest."""
+"""Least and greatest allowed values."""
 GEOMETRY = tuple(name for name in PARAMETERS if name not in (*MATERIALS, "sh"))
 SAMPLED_HEIGHT = 512
-"""Rows of the map of an emitter that is not taken texel by texel."""
+"""Rows of the map sampled from an emitter whose texels are not read directly."""
 OVERSAMPLING = 3
-"""Rows that are asked for, for each row of such a map."""
+"""Rows sampled for each row of such a map."""
 
 
 class GuidanceAppearance:
@@ -89,7 +89,7 @@ class GuidanceAppearance:
         return Shown(shaded[self.buffer], surface.opacity, [*extra, surface.opacity])
 
     def _lighting(self, scene: mi.Scene) -> Lighting:
-        """Prepared once, and again when the scene's light has changed."""
+        """The prepared light; it is prepared again when the scene's light has changed."""
         state = None if self._environment else light_state(scene)
         if self._prepared is None or self._prepared[0] != state:
             environment = self._environment or environment_of(scene)
@@ -125,8 +125,8 @@ def _given_environment(properties: mi.Properties) -> EnvironmentMap | None:
 class Bounces:
     """Bakes of a plugin's surfels: transport is kept until they move, direct light until they or it change.
 
-    Where gradients are wanted the bounces themselves are gathered anew at each render, attached to the
-    materials: light that has met a surfel carries the gradient of its base color.
+    If gradients are wanted, the bounces are gathered again at each render, attached to the materials: light
+    reflected by a surfel carries the gradient of its base color.
 
     Args:
         surfels: the plugin's.
@@ -141,7 +141,7 @@ class Bounces:
     def bake(self, lighting: Lighting) -> BouncedLight:
         """The light of ``lighting`` at each surfel, attached to materials whose gradients are wanted.
 
-        Its rays are those of seed 0, whatever the sensor's.
+        Its rays use seed 0, regardless of the sensor's seed.
         """
         geometry = self.surfels.state(*GEOMETRY)
         with dr.suspend_grad():
@@ -158,7 +158,7 @@ class Bounces:
 
 
 def environment_of(scene: mi.Scene) -> EnvironmentMap:
-    """The light of ``scene`` from infinity, as the scene has it now.
+    """The current environment of ``scene``.
 
     Raises:
         TronError: the scene has no environment emitter.
@@ -172,7 +172,7 @@ def environment_of(scene: mi.Scene) -> EnvironmentMap:
     if emitter.class_name() != "EnvironmentMapEmitter":
         return _sampled(emitter)
     parameters: Any = mi.traverse(emitter)
-    image = np.array(parameters["data"])[:, 1:-1, :3]  # Mitsuba repeats a column at either side
+    image = np.array(parameters["data"])[:, 1:-1, :3]  # Mitsuba pads a column on either side
     rotation = _turn_about_z(np.array(parameters["to_world"].matrix)[..., 0])
     if rotation is None or image.shape[1] != 2 * image.shape[0]:
         return _sampled(emitter)
@@ -180,7 +180,7 @@ def environment_of(scene: mi.Scene) -> EnvironmentMap:
 
 
 def light_state(scene: mi.Scene) -> list[Any]:
-    """Equal for equal states of the scene's environment; changes when a parameter of it does."""
+    """A value that is equal for equal states of the scene's environment."""
     emitter = scene.environment()
     if emitter is None:
         return []
@@ -188,7 +188,7 @@ def light_state(scene: mi.Scene) -> list[Any]:
 
 
 def _turn_about_z(to_world: np.ndarray) -> float | None:
-    """Degrees by which an upright map is turned about +z; None if it does not stand upright."""
+    """Rotation of an upright map about +z in degrees; None if the map is not upright."""
     upright = np.array([[1.0, 0, 0], [0, 0, -1], [0, 1, 0]])  # rotate([1, 0, 0], 90)
     turn = to_world[:3, :3] @ upright.T
     angle = math.atan2(turn[1, 0], turn[0, 0])
@@ -199,12 +199,12 @@ def _turn_about_z(to_world: np.ndarray) -> float | None:
 
 
 def _sampled(emitter: mi.Emitter) -> EnvironmentMap:
-    """The emitter's radiance by directions; rows stand on the poles, columns on half texels."""
+    """Sample the emitter's radiance into a map; rows stand on the poles, columns on half texels."""
     rows = OVERSAMPLING * SAMPLED_HEIGHT
     texel = dr.arange(mi.UInt32, 2 * rows * rows)
     polar = mi.Float(texel // (2 * rows)) * (math.pi / (rows - 1))
     across, along = dr.sincos((mi.Float(texel % (2 * rows)) + 0.5) * (math.pi / rows))
-    sin, cos = dr.sincos(dr.clip(polar, 1e-4, math.pi - 1e-4))  # at a pole an azimuth is anybody's guess
+    sin, cos = dr.sincos(dr.clip(polar, 1e-4, math.pi - 1e-4))  # at a pole the azimuth is undefined
     si = dr.zeros(mi.SurfaceInteraction3f, 2 * rows * rows)
     si.wi = -mi.Vector3f(sin * across, sin * along, cos)
     radiance = mi.Color3f(emitter.eval(si)) + dr.zeros(mi.Color3f, 2 * rows * rows)

@@ -2,33 +2,32 @@
 
     property       type      meaning
     lights         object    environment maps: tron.integrators.embed([map, ...])
-    max_depth      integer   longest path in segments, as of Mitsuba's ``path`` (default: 6)
+    max_depth      integer   longest path in segments, as in Mitsuba's ``path`` (default: 6)
     hide_emitters  boolean   leave out the light that is seen directly (default: false)
-    first_rays     integer   shadow rays at the surface that is seen (default: as many as lights)
-    later_rays     integer   shadow rays at each surface that light came by (default: two fifths of those)
+    first_rays     integer   shadow rays at the first hit of a path (default: as many as lights)
+    later_rays     integer   shadow rays at each later hit (default: two fifths of first_rays)
 
-Channels ``light0.R``, ``light0.G`` and so on are linear radiance under each light, in expectation what
-``path`` renders of the scene under that light alone; main channels are their mean. Emitters of the Mitsuba
-scene are not seen.
+Channels ``light0.R``, ``light0.G`` and so on are linear radiance under each light, in expectation equal to
+``path``'s render of the scene under that light alone; the main channels are their mean. Emitters of the
+Mitsuba scene are not seen.
 
-Paths, hits and materials do not depend on the light, so all lights share them. At each hit shadow rays go
-where any of the lights is bright (:class:`StackedLights`), and each that
-arrives brings the radiance of all lights: what a ray costs is paid once. Together with the material's own
-sample, which brings their radiance where it leaves the scene, they are weighted by the balance heuristic
-(Veach 1997), one weight for all lights:
+Paths, hits and materials do not depend on the light, so all lights share them. At each hit, shadow rays go
+where any of the lights is bright (:class:`StackedLights`), and each unblocked ray adds the radiance of all
+lights: a ray's cost is paid once. They and the material's own sample, which adds the lights' radiance when it
+leaves the scene, are weighted by the balance heuristic (Veach 1997), one weight for all lights:
 
     K rays of density q and one of density p:   L f cos / (K q + p)   for each of the K + 1
 
-A bilinear map is a sum of texels, each a small light of its own whose shape is its hat: what texel j sends
-from direction d is hat_j(d) L_j, and the hats sum to one. So a light's sample is a texel and a direction
-within its hat, and a direction that was found otherwise picks one of the four hats above it by their heights
-(stochastic texture filtering, Fajardo et al. 2023). Either way one texel is read, all lights' radiances lie
-side by side in it, and because hat_j is a factor of the density and of the radiance it leaves every weight.
+A bilinear map is a sum of texels, each a small light in the shape of a hat function: texel j sends radiance
+hat_j(d) L_j from direction d, and the hats sum to one. So a light's sample is a texel and a direction within
+its hat, and a direction from the material picks one of the four hats above it in proportion to their heights
+(stochastic texture filtering, Fajardo et al. 2023). Either way one texel is read, in which all lights'
+radiances lie side by side. hat_j is a factor of both density and radiance, so it cancels from every weight.
 
 Texels are drawn from one distribution for all lights: proportional to the root of the sum of squares of the
-lights' luminances, each over its own mean. Of all densities q it makes the sum over lights of the integral
-of L^2 / q least: lights whose suns stand apart each keep a share, and smooth lights, which are alike, share
-theirs. It is inverted along a Hilbert curve through blocks of texels: stratified numbers stay near one
+lights' luminances, each divided by its mean. Among all densities q it minimises the sum over lights of the
+integral of L^2 / q: suns at different places each keep a share, and smooth lights, which are alike, use the
+same samples. It is inverted along a Hilbert curve through blocks of texels: stratified numbers stay near one
 another on the sphere (Steigleder & McCool 2003), so each sun gets its number of samples almost exactly.
 """
 
@@ -51,11 +50,11 @@ from tron.shading.environments.environment import PDF_FLOOR, EnvironmentMap
 NAME = "tron_many_lights"
 MAX_DEPTH = 6
 LATER_SHARE = 0.4
-"""Shadow rays at later hits over those at the first: with 20 lights 0.2 to 0.6 are as good."""
+"""Ratio of shadow rays at later hits to those at the first: with 20 lights, 0.2 to 0.6 are equally good."""
 BLOCK = 8
 """Texels along a side of the blocks that the Hilbert curve runs through."""
 PACKET = 4
-"""Numbers that one gather reads."""
+"""Numbers read by one gather."""
 ONE_BELOW = float(np.nextafter(np.float32(1), np.float32(0)))
 
 
@@ -78,7 +77,7 @@ def many_lights_class() -> type:
             rays = [first, properties.get("later_rays", math.ceil(LATER_SHARE * first))]
             if self.max_depth < 1 or min(rays) < 1:
                 raise TronError(f"{NAME} has no path or no shadow ray", mend="give numbers of 1 or more")
-            # Opaque: other numbers of rays and bounces are traced by the same kernel.
+            # Opaque, so that all numbers of rays and bounces share one kernel.
             self._depth = dr.opaque(mi.UInt32, self.max_depth)
             self._rays = [dr.opaque(mi.UInt32, number) for number in rays]
 
@@ -90,7 +89,7 @@ def many_lights_class() -> type:
             medium: mi.Medium | None = None,
             active: mi.Bool | bool = True,
         ) -> tuple[mi.Color3f, mi.Bool, list[mi.Float]]:
-            """Mitsuba's contract: mean radiance along rays, whether they hit, radiance of each light."""
+            """Mitsuba's contract: mean radiance along rays, whether they hit, radiance under each light."""
             del medium
             colors, hit = trace(
                 scene, sampler, ray, self.lights, self._depth, self._rays, self.hides, mi.Bool(active)
@@ -118,17 +117,17 @@ def trace(
     hides: bool,
     active: Any,
 ) -> tuple[list[mi.Color3f], mi.Bool]:
-    """Radiance of every light along camera rays, and where they hit.
+    """Radiance under every light along camera rays, and whether they hit.
 
     Args:
         scene: its shapes; emitters are not seen.
         sampler: of a wavefront as wide as ``ray``.
         ray: from a sensor.
-        lights: what lights the scene.
+        lights: the environments.
         max_depth: longest path, segments.
         rays: shadow rays at the first hit and at later ones.
         hides: leave out light that is seen directly.
-        active: lanes that are wanted.
+        active: lanes to trace.
     """
     context = mi.BSDFContext()
     si = scene.ray_intersect(ray, mi.RayFlags.All, coherent=True, active=active)
@@ -173,12 +172,12 @@ def trace(
 
 
 class Texel(NamedTuple):
-    """Direction that a texel sends light from, one lane each.
+    """A sampled texel and a direction within its hat, one lane each.
 
     Attributes:
         direction: unit, world.
         index: of the texel, row-major.
-        density: of drawing the direction as this texel's, per steradian and unit of its hat.
+        density: of drawing this texel and direction, per steradian, divided by the texel's hat.
     """
 
     direction: mi.Vector3f
@@ -190,10 +189,10 @@ class StackedLights:
     """Environment maps of one size, their rotations baked in.
 
     Args:
-        environments: at least one; (H, W) of all alike.
+        environments: at least one; all of the same (H, W).
 
     Raises:
-        TronError: there is none, sizes differ, or a map is turned (``EnvironmentMap.baked`` mends that).
+        TronError: there is none, sizes differ, or a map is rotated (``EnvironmentMap.baked`` mends that).
     """
 
     def __init__(self, environments: Sequence[EnvironmentMap]) -> None:
@@ -212,13 +211,13 @@ class StackedLights:
         self.count = len(environments)
         images = np.stack([environment.image for environment in environments])
         _, height, width, _ = images.shape
-        # Opaque numbers: lights of other sizes must share one compiled kernel.
+        # Opaque numbers: lights of all sizes must share one compiled kernel.
         self._width, self._height = dr.opaque(mi.UInt32, width), dr.opaque(mi.UInt32, height)
         self._column, self._row = (
             dr.opaque(mi.Float, 2 * math.pi / width),
             dr.opaque(mi.Float, math.pi / (height - 1)),
         )
-        # Half of a hat on a pole lies beyond it.
+        # Half of the hat of a texel on a pole lies beyond the pole.
         area = np.full((height, 1), 2 * math.pi / width * math.pi / (height - 1))
         area[[0, -1]] /= 2
         mass = _mass(images, environments[0].solid_angles())
@@ -231,7 +230,7 @@ class StackedLights:
         self._texels = mi.Float(aligned(texels.ravel()))
 
     def _prepare_blocks(self, mass: np.ndarray) -> np.ndarray:
-        """Lay out the distribution; return the probabilities (H, W) that it really has after rounding."""
+        """Lay out the distribution; return its actual probabilities (H, W) after rounding."""
         height, width = mass.shape
         rows, columns = -(-height // BLOCK), -(-width // BLOCK)
         padded = np.zeros((rows * BLOCK, columns * BLOCK))
@@ -241,7 +240,7 @@ class StackedLights:
         blocks = blocks[place[:, 0], place[:, 1]]
         bounds = np.cumsum(blocks.sum(axis=(1, 2)))
         bounds = np.concatenate([[0.0], bounds / bounds[-1]]).astype(np.float32)
-        # Halved again and again; what fills up a power of two lies above every number.
+        # For bisection, padded to a power of two by a value above every number.
         size = 1 << (len(blocks) - 1).bit_length()
         self._steps = [size >> k for k in range(1, size.bit_length())]
         lower = np.concatenate([bounds[:-1], np.full(size - len(blocks), 2.0, np.float32)])
@@ -265,7 +264,7 @@ class StackedLights:
         Args:
             along: place on the curve, uniform in [0, 1): stratify it.
             u: uniform in [0, 1)^2.
-            active: lanes that are wanted.
+            active: lanes to sample.
         """
         block = mi.UInt32(0)
         for step in self._steps:
@@ -293,7 +292,7 @@ class StackedLights:
         return self._texel(direction, row, column, active)
 
     def background(self, direction: mi.Vector3f, active: mi.Bool) -> list[mi.Color3f]:
-        """Bilinear radiance of every light along unit world directions: no noise where nothing is hit."""
+        """Bilinear radiance of every light along unit world directions, free of noise."""
         row, column, fy, fx = self._cell(direction)
         total = [mi.Color3f(0) for _ in range(self.count)]
         for lower in (False, True):
@@ -306,7 +305,7 @@ class StackedLights:
     def add(
         self, total: list[mi.Color3f], index: mi.UInt32, weight: mi.Color3f, active: mi.Bool
     ) -> list[mi.Color3f]:
-        """``total`` of every light, and ``weight`` times its radiance at a texel."""
+        """Add ``weight`` times every light's radiance at a texel to its ``total``."""
         numbers = []
         for k in range(self._packets):
             packet = dr.gather(mi.Vector4f, self._texels, index * self._packets + k, active)
@@ -321,7 +320,7 @@ class StackedLights:
         return Texel(direction, index, density / dr.maximum(sine, 1e-7))
 
     def _cell(self, d: mi.Vector3f) -> tuple[mi.UInt32, mi.UInt32, mi.Float, mi.Float]:
-        """Upper left of the four texels around a direction, and how far it lies towards the lower right."""
+        """Upper left of the four texels around a direction, and the direction's place between them."""
         around = dr.atan2(d.x, d.y) * (0.5 / math.pi)
         x = (around - dr.floor(around)) * mi.Float(self._width) - 0.5
         y = dr.atan2(dr.sqrt(d.x * d.x + d.y * d.y), d.z) / self._row
@@ -352,7 +351,7 @@ def _mass(images: np.ndarray, solid_angles: np.ndarray) -> np.ndarray:
 def hilbert_order(rows: int, columns: int) -> np.ndarray:
     """(rows * columns, 2) row and column of each cell of a grid, in the order of a Hilbert curve.
 
-    The curve of the smallest square of a power of two that holds the grid, outside of it left out.
+    The curve fills the smallest power-of-two square around the grid; cells outside the grid are skipped.
     """
     x, y = (part.ravel() for part in np.meshgrid(np.arange(columns), np.arange(rows)))
     place = np.stack([y, x], axis=1)
@@ -370,16 +369,16 @@ def hilbert_order(rows: int, columns: int) -> np.ndarray:
 
 
 def _cumulative(mass: np.ndarray) -> np.ndarray:
-    """Upper bounds of the last axis' shares, float32, the last 1; of nothing they are all 1."""
+    """Cumulative distribution along the last axis, float32, ending at 1; all 1 if the sum is 0."""
     total = mass.sum(axis=-1, keepdims=True)
     bounds = np.cumsum(mass, axis=-1) / np.where(total > 0, total, 1.0)
     bounds = np.where(total > 0, bounds, 1.0).astype(np.float32)
-    # Texels past the last one that weighs anything, such as those that fill up a block, begin at 1.
+    # Texels after the last one with weight, such as a block's padding, begin at 1.
     return np.where(bounds >= bounds[..., -1:], np.float32(1.0), bounds)
 
 
 def _invert(bounds: mi.Float, group: mi.UInt32, u: mi.Float, active: mi.Bool) -> tuple[mi.UInt32, mi.Float]:
-    """Member of each ``group`` of BLOCK that ``u`` falls on, and ``u`` stretched to [0, 1) within it."""
+    """Index within each ``group`` of BLOCK that ``u`` falls on, and ``u`` rescaled to [0, 1) within it."""
     member, low, high = mi.UInt32(0), mi.Float(0), mi.Float(1)
     for half in range(BLOCK // PACKET):
         packet = dr.gather(mi.Vector4f, bounds, group * (BLOCK // PACKET) + half, active)

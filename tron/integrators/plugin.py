@@ -1,11 +1,11 @@
-"""The side of an integrator that Mitsuba sees: rays of a sensor, channels of a film, parameters, gradients.
+"""Mitsuba's interface of an integrator: rays of a sensor, channels of a film, parameters, gradients.
 
-What rays show is decided by an :class:`Appearance`, one a plugin. Mitsuba's base classes differ between
-variants, so the class that Mitsuba knows is made for the active one, around an appearance.
+The :class:`Appearance` of a plugin decides the colours along rays. Mitsuba's base classes differ between
+variants, so the integrator class is made for the active variant, around an appearance.
 
-``mi.load_dict`` takes no Python object but Mitsuba's own, so scenes from memory travel inside one
-(:func:`embed`). Parameters are those of :class:`tron.tracing.parameters.SurfelParameters`, exposed to
-``mi.traverse`` one by one: flat arrays, updated and differentiated as those of any Mitsuba plugin.
+``mi.load_dict`` accepts only Mitsuba's own objects, so scenes from memory are wrapped in one
+(:func:`embed`). The parameters of :class:`tron.tracing.parameters.SurfelParameters` are exposed to
+``mi.traverse`` one by one: flat arrays, updated and differentiated like those of any Mitsuba plugin.
 """
 
 from __future__ import annotations
@@ -29,7 +29,7 @@ MAX_SH_DEGREE = 3
 
 @dataclass
 class Shown:
-    """Colours along rays, one lane a ray.
+    """Colours along rays, one lane per ray.
 
     Attributes:
         color: the main channels.
@@ -43,22 +43,22 @@ class Shown:
 
 
 class Appearance(Protocol):
-    """View of a plugin on its surfels.
+    """How a plugin shows its surfels.
 
     Attributes:
-        channels: names of the channels beside color and alpha, as Mitsuba's ``aov`` integrator names its own.
+        channels: names of the channels beside color and alpha, in the style of Mitsuba's ``aov`` integrator.
     """
 
     surfels: Surfels
     channels: list[str]
 
     def show(self, scene: mi.Scene, ray: mi.Ray3f, active: mi.Bool, width: int, seed: int) -> Shown:
-        """Colours along rays; ``width`` of them make a row of an image, ``seed`` roots random numbers."""
+        """Colours along rays; ``width`` rays make a row of an image, ``seed`` roots random numbers."""
         ...
 
 
 def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type:
-    """The integrator ``name`` for the active variant, around the appearance that ``make`` reads."""
+    """The integrator class ``name`` for the active variant; ``make`` reads its appearance from properties."""
     from mitsuba.python.ad.integrators.common import ADIntegrator as Steps
 
     class Plugin(mi.SamplingIntegrator):
@@ -75,7 +75,7 @@ def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type
             develop: bool = True,
             evaluate: bool = True,
         ) -> mi.TensorXf:
-            """Mitsuba's contract; attached to the parameters, so its default gradients are those of this."""
+            """Mitsuba's contract; attached to the parameters, so its default gradients are right."""
             sensor = scene.sensors()[sensor] if isinstance(sensor, int) else sensor
             film = sensor.film()
             sampler, spp = Steps.prepare(self, sensor, seed, spp, self.aov_names())
@@ -83,7 +83,7 @@ def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type
             border = 2 * film.rfilter().border_size() if film.sample_border() else 0
             width = (film.crop_size().x + border) * spp
             root = seed if isinstance(seed, int) else int(seed[0])
-            # Mitsuba evaluates loops step by step for gradients by AD; the tracer replays hit lists instead.
+            # For AD Mitsuba would evaluate loops step by step; the tracer replays hit lists instead.
             with dr.scoped_set_flag(dr.JitFlag.SymbolicLoops, True):
                 shown = self.appearance.show(scene, ray, mi.Bool(True), width, root)
             block = film.create_block()
@@ -130,15 +130,15 @@ def plugin_class(name: str, make: Callable[[mi.Properties], Appearance]) -> type
 
 
 def embed(value: Any) -> mi.Object:
-    """A GaussianScene, an EnvironmentMap or a list of them for ``mi.load_dict``; the variant must be set."""
+    """Wrap a GaussianScene, an EnvironmentMap or a list for ``mi.load_dict``; the variant must be set."""
     return _carrier(mi.variant())(value)
 
 
 def unwrap(properties: mi.Properties, name: str, kind: type, plugin: str) -> Any:
-    """Content that :func:`embed` put into property ``name``.
+    """The object that :func:`embed` put into property ``name``.
 
     Raises:
-        TronError: something else is there.
+        TronError: the property holds something else.
     """
     carried = getattr(properties[name], "carried", None)
     if not isinstance(carried, kind):
@@ -151,7 +151,7 @@ def unwrap(properties: mi.Properties, name: str, kind: type, plugin: str) -> Any
 
 @cache
 def _carrier(variant: str) -> type:
-    """Mitsuba's classes differ between variants, so there is one subclass for each."""
+    """The wrapper class; Mitsuba's classes differ between variants, so each has its own."""
 
     class Carrier(mi.Object):
         def __init__(self, carried: Any) -> None:
@@ -193,13 +193,13 @@ class Surfels:
             callback.put(name, getattr(self.parameters, name), mi.ParamFlags.Differentiable)
 
     def parameters_changed(self) -> None:
-        """Take new values of the parameters: shapes stay, surfels may have moved."""
-        # Harmonics of any degree may have come, or be about to be learnt.
+        """Apply new values of the parameters: shapes stay, surfels may have moved."""
+        # Harmonics of any degree may have been set, or are about to be learnt.
         self.parameters.sh_degree = MAX_SH_DEGREE
         self.tracer.update()
 
     def state(self, *names: str) -> list[Held]:
-        """Equal for equal states of these parameters."""
+        """A value that is equal for equal states of these parameters."""
         return [Held(getattr(self.parameters, name)) for name in names]
 
     def trace(
@@ -211,7 +211,7 @@ class Surfels:
     ) -> Surface:
         """Surfaces along rays, attached to the parameters where their gradients are wanted.
 
-        ``values`` as of :meth:`tron.tracing.SurfelTracer.trace`.
+        ``values`` as in :meth:`tron.tracing.SurfelTracer.trace`.
         """
         if dr.grad_enabled(self.parameters.sh):
             self.parameters.sh_degree = MAX_SH_DEGREE
@@ -219,7 +219,7 @@ class Surfels:
 
 
 class Held:
-    """A parameter, equal to itself while its variables are the same; held, so that none takes their place."""
+    """A parameter that compares equal while its variables are the same; held, so that no index is reused."""
 
     def __init__(self, value: Any) -> None:
         self._value = dr.detach(value) if dr.is_array_v(value) else value

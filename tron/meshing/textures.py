@@ -1,4 +1,4 @@
-"""Textures of a mesh from surfels: what rays meet that look at the surface from just outside.
+"""Textures of a mesh from surfels, by rays onto the surface from just outside.
 
 xatlas lays the triangles out flat, Mitsuba finds which one covers a texel, and the tracer composites the
 surfels along the normal there, as a camera would see them.

@@ -76,7 +76,7 @@ def outline(parts: Sequence[Part]) -> Trimesh:
 
 
 def joined(parts: Sequence[Part]) -> Part:
-    """One part of several with the same textures; their vertices are counted on."""
+    """Join parts with the same textures into one; vertex indices are offset."""
     offsets = np.cumsum([0, *(len(part.vertices) for part in parts)])
     first = parts[0]
 

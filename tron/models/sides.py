@@ -1,4 +1,4 @@
-"""Backs of open sheets, as polygons of their own: surfels face one way, and a leaf is seen from both.
+"""Backs of open sheets as separate polygons, because surfels face one way and a leaf is seen from both.
 
 Meshes are taken as Blender takes them: every polygon is seen from either side, whatever ``doubleSided`` of a
 glTF says. A sheet that its own edges close and that faces outwards shows no back, and gets none. Of all other

@@ -1,4 +1,4 @@
-"""A scan filmed: what cameras see of its surfels, as the views of a capture."""
+"""Film a scan: render its surfels for cameras, as the views of a capture."""
 
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ THIN = 0.02
 
 
 def film(scan: GaussianScene, cameras: Sequence[Camera], track: Track = untracked) -> list[View]:
-    """What cameras see of a scan: display values, with its opacity as their mask, and median depths."""
+    """Render views of a scan: display values, its opacity as their mask, and median depths."""
     tracer, views = SurfelTracer(scan), []
     for number, camera in enumerate(track(cameras, "filming splats")):
         buffers = seen_by(tracer, camera).numpy()
@@ -37,5 +37,5 @@ def straight_color(buffers: Mapping[str, np.ndarray]) -> np.ndarray:
 
 
 def film_of_scan(scan: GaussianScene, cameras: Sequence[Camera], track: Track = untracked) -> Capture:
-    """The capture of a scan whose surfels are to stay, of which none of the views is held out."""
+    """Make the capture of a scan whose surfels are kept; no view is held out."""
     return Capture(tuple(film(scan, cameras, track)), up=scan.up, offset=scan.offset, scan=scan)

@@ -1,4 +1,4 @@
-"""How long loops say how far they have come."""
+"""Progress reports of long loops."""
 
 from __future__ import annotations
 
@@ -9,5 +9,5 @@ Track = Callable[[Iterable, str], Iterable]
 
 
 def untracked(items: Iterable, _label: str) -> Iterable:
-    """The items, without any word of how far the work on them has come."""
+    """The items, without any progress report."""
     return items

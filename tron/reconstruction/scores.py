@@ -1,9 +1,9 @@
 """Scores of a reconstruction: its pictures against photos, its maps against the truth where there is any.
 
-Pictures are compared over the whole frame, less what a view's ``valid`` leaves out (SSIM and LPIPS, which
-look at neighbourhoods, take the picture to be right there), behind the subject the background that was
-trained with, and on the subject where views have masks. Base color is known up to a factor: it is scaled for
-each view and channel by least squares on the subject, as the TRON paper does (conventions.md, 11).
+Pictures are compared over the whole frame, with the training background behind the subject, and on the
+subject if views have masks. Pixels excluded by a view's ``valid`` do not count (SSIM and LPIPS, which use
+neighbourhoods, see the true picture there). Base color is known up to a factor: it is scaled for each view
+and channel by least squares on the subject, as in the TRON paper (conventions.md, 11).
 """
 
 from __future__ import annotations
@@ -22,7 +22,7 @@ from tron.reconstruction.progress import Track, untracked
 from tron.tracing import GBuffer
 
 LOOKS = ("psnr", "ssim", "lpips", "psnr_subject")
-"""Figures of pictures alone, not of maps."""
+"""Figures of pictures only, not of maps."""
 _SUBJECT = 0.5
 BACKGROUND = {"black": 0.0, "white": 1.0, "random": 0.0}
 _LPIPS_LEAST_SIDE = 16
@@ -43,7 +43,7 @@ class ViewScore:
 
 
 class Seen(Protocol):
-    """What a camera sees of surfels: of a tracer, or of a Relighter, which turns surfels without a sign."""
+    """Renders the G-buffer of surfels: a tracer, or a Relighter, which orients surfels without a sign."""
 
     @property
     def scene(self) -> GaussianScene: ...

@@ -16,12 +16,12 @@ from tron.estimation import FINAL, Brdf, Estimation, Estimator
 Model = TypeVar("Model", bound="Settings")
 
 Place = Literal["in place", "near", "anywhere"]
-"""Place that surfels begin at: on the surface (depth maps), near it (stereo), or anywhere."""
+"""Where surfels begin: on the surface (depth maps), near it (stereo), or anywhere."""
 Indoors = bool | Literal["auto"]
-"""Whether photos were taken in a room; auto: what was found of it says."""
+"""Whether photos were taken in a room; auto: decided from the reconstruction."""
 
 _FASTER: dict[Place, tuple[float, float]] = {"in place": (0, 0), "near": (0.25, 0.5), "anywhere": (0.5, 0.5)}
-"""Powers of the number of steps by which positions and rotations learn faster in fewer."""
+"""Exponents of the shortening by which positions and rotations learn faster in fewer steps."""
 
 
 class Settings(BaseModel):
@@ -123,14 +123,14 @@ class DensitySettings(Settings):
     )
 
     def seen_in(self, pixels: int) -> DensitySettings:
-        """The same for photos of so many pixels."""
+        """The settings for photos with this number of pixels."""
         if self.per_pixel is None:
             return self
         return self.model_copy(update={"most": max(min(self.most, round(self.per_pixel * pixels)), 4)})
 
 
 class ConsistencySettings(FusionSettings):
-    """Normals pulled to those that the surfels' own depths agree on, where no prior gives normals."""
+    """Normals pulled to the fused normals of the surfels' own depths, if no prior gives normals."""
 
     weight: float = Field(
         default=0.1, ge=0, description="Weight of opacity - (sum of w n) . N in the loss; 0 leaves it out."
@@ -300,7 +300,7 @@ class FitSettings(Settings):
     seed: int = Field(default=0, description="Root of every random number.")
 
     def estimation(self, rays: int, *, filtered: bool = False) -> Estimation:
-        """Estimation of images of the surfels in the light, as that of the fit."""
+        """Estimation for rendering surfels in the light, consistent with the fit's."""
         return Estimation(
             rays=rays,
             estimator=self.estimator,

@@ -1,19 +1,19 @@
-"""Light that arrives at a surface -> radiance that leaves it towards a view: one formula for every picture.
+"""Light arriving at a surface -> radiance leaving it towards a view: one formula for every picture.
 
-    pbr         kd U + S                       nothing in the way
+    pbr         kd U + S                       no occlusion
     shadowed    kd E + S                       shadows on the diffuse part
-    lit         kd (E + I) + o S + ks M        and light that has met the scene
+    lit         kd (E + I) + o S + ks M        with bounced light
 
-U is the unshadowed irradiance / pi, E what arrives of it, I the irradiance / pi of bounced light, S the
-split-sum specular of the environment alone, o the share of it that escapes the scene, M the mean radiance
-over the lobe of the scene that is in the way of the rest. kd and ks are those of
+U is the unshadowed irradiance / pi, E the shadowed irradiance / pi, I the irradiance / pi of bounced light, S
+the split-sum specular of the environment, o the share of S that is not occluded by the scene, and M the mean
+radiance over the lobe of the scene parts that occlude it. kd and ks come from
 :mod:`tron.brdf.reflectance`.
 
-Without reflection rays (:mod:`tron.shading.reflections`) M is I: the scene shines into the lobe as it does
-from everywhere. And o is (1 - roughness) openness + roughness E / U: a rough lobe sees what a diffuse surface
-sees, a mirror mostly something else than the sun that E is about. On training scenes that is 0.3 to 0.4 dB
-above openness alone. But radiance in the lobe far beyond U comes from lamps, which are most of U. Where most
-of U arrives they are seen; where little does they are hidden, and the lobe has no more of the rest than E.
+Without reflection rays (:mod:`tron.shading.reflections`) M is I: the scene is as bright in the lobe as in all
+directions. And o is (1 - roughness) openness + roughness E / U: a rough lobe sees the same light as a diffuse
+surface, a mirror mostly misses the sun that dominates E. On training scenes this gains 0.3 to 0.4 dB over
+openness alone. But radiance in the lobe far above U comes from lamps, which make up most of U. Where most of
+U arrives they are visible; where little arrives they are hidden, and the lobe's radiance is limited to E.
 """
 
 from __future__ import annotations
@@ -36,19 +36,19 @@ if TYPE_CHECKING:
 
 
 LAMP = 4.0
-"""Times U from which on radiance in a lobe is a lamp's; from twice that on the rest is what arrives, E."""
+"""Radiance in a lobe above this many times U is a lamp's; above twice that, the limit is fully E."""
 HIDDEN, SEEN = 0.25, 0.75
-"""E / U up to which the lamps that a lobe meets are hidden, and from which on they are seen."""
+"""E / U up to which the lamps in a lobe are hidden, and above which they are visible."""
 CLEAR_TRANSMITTANCE = 0.25
-"""From here on what lies behind is seen with its full share."""
+"""Transmittance from which the background is seen with its full share."""
 _END = 1 / 64
-"""The transition is 0 and 1 in float32 this near its ends, where its terms would overflow."""
+"""This near its ends the transition is 0 or 1 in float32; its terms would overflow there."""
 Array = TypeVar("Array")
 
 
 @dataclass
 class Bounced:
-    """Light that has met the scene, at surfaces, one lane each, linear.
+    """Bounced light at surfaces, one lane each, linear.
 
     Attributes:
         indirect: I, irradiance / pi.
@@ -76,7 +76,7 @@ class Response:
     ) -> Response:
         """The response along the surface's own rays; differentiable by material, normal and light.
 
-        ``looked_up``: the same of another roughness, by whose lobe light is looked up; None: by its own.
+        ``looked_up``: a surface of another roughness, whose lobe looks up the light; None: its own.
         """
         normal, to_camera = shading_normal(surface), -surface.direction
         cosine = dr.dot(normal, to_camera)
@@ -93,11 +93,11 @@ class Response:
         return self.diffuse * self.unshadowed + self.specular
 
     def direct(self, irradiance: mi.Color3f) -> mi.Color3f:
-        """Radiance of direct light, of which ``irradiance`` / pi arrives."""
+        """Radiance by direct light, given its shadowed ``irradiance`` / pi."""
         return self.diffuse * irradiance + self.specular
 
     def lit(self, irradiance: mi.Color3f, bounced: Bounced) -> mi.Color3f:
-        """Radiance of all light: ``irradiance`` / pi of it is direct."""
+        """Radiance by all light, given the shadowed ``irradiance`` / pi of direct light."""
         return (
             self.diffuse * (irradiance + bounced.indirect)
             + bounced.openness * self.specular
@@ -108,14 +108,14 @@ class Response:
 def evenly_bounced(
     indirect: mi.Color3f, openness: mi.Float, visibility: mi.Color3f, roughness: mi.Float, response: Response
 ) -> Bounced:
-    """Bounced light without reflection rays: from everywhere alike.
+    """Bounced light without reflection rays: the same from all directions.
 
     Args:
         indirect: I.
-        openness: share of the directions, by the cosine, in which nothing is met.
+        openness: cosine-weighted share of the directions in which no surfel is met.
         visibility: E / U.
         roughness: in [0, 1].
-        response: U, and the lobe that is shared.
+        response: U and the lobe.
     """
     direct = dr.minimum(visibility, 1)
     share = dr.lerp(mi.Color3f(openness), direct, roughness)
@@ -128,7 +128,7 @@ def evenly_bounced(
 
 
 def ratio(part: mi.Color3f, whole: mi.Color3f, otherwise: float) -> mi.Color3f:
-    """Part over whole by channel; ``otherwise`` where there is no whole."""
+    """Part over whole by channel; ``otherwise`` where the whole is 0."""
     pairs = zip(part, whole, strict=True)
     return mi.Color3f(*[dr.select(b > 0, a / dr.select(b > 0, b, 1), otherwise) for a, b in pairs])
 
@@ -140,12 +140,12 @@ def background_share(transmittance: Array) -> Array:
                    T / (1 + exp(1/s - 1/(1 - s)))               s = (T - 0.01) / (0.25 - 0.01)
                    T                                            T >= 0.25
 
-    Surfels that make up a solid leave a few thousandths of the light, a hundredth of all rays more than two
-    hundredths. That is invisible until a sun stands behind: its radiance may be 10^4 times exposed white. So
-    a transmittance below 0.01 counts as none, as it does for shadow rays, and the rest comes back by the
-    smooth transition function, which is flat to every order at both ends: at T = 0.026 it lets through 10^-8.
-    The share is smooth and monotone. What is shaded has the weight 1 - share, so that opaque surfels are not
-    dimmed either. Opacity itself, which is the mask, stays 1 - T.
+    The surfels of a solid let through a few thousandths of the light, and on one ray in a hundred more than
+    0.02. That is invisible until a sun stands behind: its radiance may be 10^4 times exposed white. So a
+    transmittance below 0.01 counts as none, as for shadow rays, and above it a smooth transition, flat to
+    every order at both ends, blends to the full share: at T = 0.026 it lets through 10^-8. The share is
+    smooth and monotone. Shading has the weight 1 - share, so that opaque surfels are not dimmed either.
+    Opacity itself, which is the mask, stays 1 - T.
 
     Args:
         transmittance: 1 - opacity of the surfels along a ray, any shape, in [0, 1]; differentiable if it is
@@ -159,5 +159,5 @@ def background_share(transmittance: Array) -> Array:
 
 
 def over_background(shaded: mi.Color3f, behind: mi.Color3f, opacity: mi.Float) -> mi.Color3f:
-    """Linear radiance of surfels of this ``opacity`` in front of ``behind``; of none, ``behind`` alone."""
+    """Linear radiance of surfels of this ``opacity`` in front of ``behind``; at opacity 0, ``behind``."""
     return dr.select(opacity > 0, dr.lerp(shaded, behind, background_share(1 - opacity)), behind)

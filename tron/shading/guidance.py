@@ -1,22 +1,21 @@
 """G-buffer + environment -> guidance: the buffers that the neural renderer is conditioned on.
 
-    pbr         unshadowed split-sum, as of even light
-    irradiance  what a white diffuse surface sends out, shadows included: U times the share that arrives
+    pbr         unshadowed split-sum shading
+    irradiance  radiance of a white diffuse surface, shadows included: U times visibility
     shadowed    direct light, with shadows on the diffuse part
-    indirect    irradiance / pi by light that bounced between the surfels (:mod:`tron.shading.bounces.bounce`)
-    lit         all light: what a path tracer shows
+    indirect    irradiance / pi of light that bounced between surfels (:mod:`tron.shading.bounces.bounce`)
+    lit         all light, as a path tracer would show it
 
-The formulas are those of :mod:`tron.shading.composition`; U is the unshadowed irradiance / pi. The n-ray
-estimates of shadowed and unshadowed irradiance share their rays, so the share that arrives keeps the shadows
-and sheds the noise of the light, and U, which has none, puts the light back (Heitz et al. 2018). From 16 rays
-it is their ratio, below a regression that is not biased in shadow (:mod:`tron.shading.direct.visibility`). At
-64 rays under a sun this takes the relative error from 0.13 to 0.04; irradiance over unshadowed is exactly 1
-where nothing is in the way. :class:`tron.estimation.Estimation` chooses, also the paper's plain mean.
+:mod:`tron.shading.composition` has the formulas; U is the unshadowed irradiance / pi. The n-ray estimates of
+shadowed and unshadowed irradiance share their rays, so visibility, their quotient, keeps the shadows without
+the noise of the light; the noiseless U then restores the light (Heitz et al. 2018). From 16 rays visibility
+is this ratio, below a regression without bias in shadow (:mod:`tron.shading.direct.visibility`). With 64 rays
+under a sun the relative error falls from 0.13 to 0.04; irradiance over unshadowed is exactly 1 where nothing
+blocks. :class:`tron.estimation.Estimation` selects the estimator, including the paper's plain mean.
 
-Every buffer shows the environment where surfels are absent: (1 - share) x shaded + share x radiance seen,
-with the share of :mod:`tron.shading.composition`, exactly 0 behind opaque surfels. All of it is linear;
-exposure and AgX are applied when a buffer is looked at or loaded. What glows adds what it emits to pbr,
-shadowed and lit.
+Every buffer shows the environment behind the surfels: (1 - share) x shaded + share x radiance seen, with the
+share of :mod:`tron.shading.composition`, exactly 0 behind opaque surfels. All buffers are linear; exposure
+and AgX are applied when a buffer is displayed or loaded. Emission is added to pbr, shadowed and lit.
 """
 
 from __future__ import annotations
@@ -62,14 +61,14 @@ class Guidance:
     Attributes:
         pbr: (H, W, 3) unshadowed split-sum radiance.
         irradiance: (H, W, 3) shadowed irradiance / pi.
-        unshadowed: (H, W, 3) the same with nothing in the way.
+        unshadowed: (H, W, 3) irradiance / pi without shadows.
         shadowed: (H, W, 3) radiance: shadowed diffuse plus split-sum specular.
-        indirect: (H, W, 3) irradiance / pi by bounced light; 0 on surfels where none was baked.
-        lit: (H, W, 3) radiance with bounced light; ``shadowed`` where none was baked.
+        indirect: (H, W, 3) irradiance / pi of bounced light; 0 on surfels if none was baked.
+        lit: (H, W, 3) radiance with bounced light; equal to ``shadowed`` if none was baked.
         mask: (H, W) opacity of the surfels in [0, 1].
-        gbuffer: ``GBuffer.numpy()``, which is no buffer of its own; of sub-pixels the means
+        gbuffer: ``GBuffer.numpy()``, not one of the buffers; with sub-pixels, their means
             (:func:`tron.shading.guidance.averaged_surface`).
-        lighting: the light it is of, whose exposure pictures have.
+        lighting: the light, which sets the exposure of pictures.
     """
 
     pbr: np.ndarray
@@ -84,13 +83,13 @@ class Guidance:
     BUFFERS: ClassVar[tuple[str, ...]]
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """(H, W, C) float32 of one of :attr:`BUFFERS`: C is 1 for the mask, 3 for the others."""
+        """One of :attr:`BUFFERS` as (H, W, C) float32: C is 1 for the mask, 3 for the others."""
         if name not in self.BUFFERS:
             raise KeyError(name)
         return np.atleast_3d(getattr(self, name))
 
     def exposure(self, look: Look = "photograph") -> float:
-        """Factor on linear values before AgX that a photographer would choose; 1 of a frame without light.
+        """Factor on linear values before AgX that a photographer would choose; 1 for a frame without light.
 
         Raises:
             TronError: nothing is lit.
@@ -108,13 +107,13 @@ class Guidance:
         exposure: float | None = None,
         look: Look = "photograph",
     ) -> None:
-        """Write a buffer: as a picture to .png or .jpg, its linear values to .exr or .hdr.
+        """Write a buffer: a picture to .png or .jpg, linear values to .exr or .hdr.
 
         Args:
-            path: of the file; its suffix chooses.
+            path: the file; its suffix selects the format.
             name: one of :attr:`BUFFERS`. Pictures of light are exposed and go through AgX.
             exposure: factor before AgX; None: :meth:`exposure`.
-            look: of pictures (:data:`tron.color.LOOKS`).
+            look: AgX look of pictures (:data:`tron.color.LOOKS`).
 
         Raises:
             TronError: nothing is lit, or the file cannot be written.
@@ -136,12 +135,12 @@ Guidance.BUFFERS = tuple(
 
 @dataclass
 class Arriving:
-    """Findings of rays from surfaces, one lane each.
+    """Results of the rays from surfaces, one lane per surface point.
 
     Attributes:
         visibility: share of the unshadowed irradiance that arrives, by channel.
-        mirror: by reflection rays; None without.
-        metals: by those of metals alone, in previews (:mod:`tron.shading.reflections`); None without.
+        mirror: result of reflection rays; None without them.
+        metals: result of metals' reflection rays, in previews (:mod:`tron.shading.reflections`); or None.
         behind: radiance behind the surfels (:class:`tron.relighting.ground.Ground`); None: the environment's.
     """
 
@@ -151,7 +150,7 @@ class Arriving:
     behind: mi.Color3f | None = None
 
     def in_rows(self, gbuffer: GBuffer) -> Arriving:
-        """Of pixels row by row, where lanes are those of ``gbuffer``."""
+        """The same with one lane per pixel, row by row, from the lanes of ``gbuffer``."""
         found = (self.visibility, self.mirror, self.metals, self.behind)
         return Arriving(*(None if value is None else gbuffer.in_rows(value) for value in found))
 
@@ -171,11 +170,11 @@ def render_guidance(
         tracer: the scene.
         camera: the view.
         lighting: the prepared environment.
-        estimation: of the light.
+        estimation: how light is estimated.
         seed: root of the rays' random numbers.
         background: linear RGB radiance behind the surfels; None: the environment.
-        bounce: what ``lighting`` is at each surfel (``BounceTransport.bake``); None, or with no bounces in
-            ``estimation``: no light bounces.
+        bounce: ``lighting`` baked at each surfel (``BounceTransport.bake``). If None, or without bounces
+            in ``estimation``, no light bounces.
     """
     gbuffer = trace_view(tracer, camera, estimation, bounce)
     arriving = arriving_light(tracer, gbuffer, lighting, estimation, seed, bounce)
@@ -185,14 +184,14 @@ def render_guidance(
 def trace_view(
     tracer: ViewTracer, camera: Camera, estimation: Estimation = FINAL, bounce: BouncedLight | None = None
 ) -> GBuffer:
-    """The G-buffer that :func:`shade` takes: of sub-pixels, if so, and with the values of ``bounce``."""
+    """Trace the G-buffer for :func:`shade`, with the values of ``bounce`` and any sub-pixels."""
     return trace_views(tracer, camera, estimation, [bounce])[0]
 
 
 def trace_views(
     tracer: ViewTracer, camera: Camera, estimation: Estimation, bounces: Sequence[BouncedLight | None]
 ) -> list[GBuffer]:
-    """:func:`trace_view` under many lights, traced once: they differ in the values of their ``bounces``."""
+    """G-buffers of :func:`trace_view` for many lights, traced once; only values of ``bounces`` differ."""
     times = estimation.supersample
     values = [bounce.values(estimation.rays) if bounce and estimation.bounces else [] for bounce in bounces]
     view = camera if times == 1 else camera.resized(times * camera.width, times * camera.height)
@@ -210,7 +209,7 @@ def arriving_light(
     seed: int,
     bounce: BouncedLight | None = None,
 ) -> Arriving:
-    """Light that reaches the pixels of :func:`trace_view`; arguments as of :func:`render_guidance`."""
+    """Light that reaches the pixels of :func:`trace_view`; arguments as in :func:`render_guidance`."""
     estimation = estimation.of_sub_pixel()
     if estimation.rays == 0 and len(gbuffer.values) > BOUNCED_VALUES:
         arriving = arrived(gbuffer)
@@ -228,7 +227,7 @@ def arriving_light(
 
 
 def arrived(surface: Surface) -> Arriving:
-    """Light that has reached surfels, of a ``surface`` with all values of a bake: found without a ray."""
+    """Light that reaches a ``surface`` with all values of a bake, read from them without any ray."""
     return Arriving(mi.Color3f(*surface.values[BOUNCED_VALUES:]))
 
 
@@ -239,10 +238,10 @@ def shade_surface(
     background: Sequence[float] | None = None,
     brdf: Brdf = "conserving",
 ) -> dict[str, mi.Color3f]:
-    """Shade what rays see, given the light that reaches each of them.
+    """Shade the surfaces that rays see, given the light that reaches them.
 
-    Light bounces where ``surface`` has the values of a bake (``BouncedLight.values``). ``background`` as of
-    :func:`render_guidance`. Returns the colours of :class:`Guidance` by name, on the device, one lane a ray.
+    Bounced light is included if ``surface`` has the values of a bake (``BouncedLight.values``).
+    ``background``: as in :func:`render_guidance`. Returns :class:`Guidance` colours by name, a lane per ray.
     """
     response = Response.of(surface, lighting.split_sum, brdf)
     irradiance = response.unshadowed * arriving.visibility
@@ -270,7 +269,7 @@ def shade_surface(
 
 
 def bounced_light(surface: Surface, arriving: Arriving, response: Response) -> Bounced | None:
-    """Light that has met the scene, of a surface with the values of a bake; None without."""
+    """Bounced light of a surface with the values of a bake; None without them."""
     if not surface.values:
         return None
     indirect, openness = mi.Color3f(*surface.values[:3]), surface.values[BOUNCED_VALUES - 1]
@@ -289,7 +288,7 @@ def shade(
 ) -> Guidance:
     """Guidance from a G-buffer of :func:`trace_view` and the light that reaches its pixels.
 
-    Arguments as of :func:`render_guidance`.
+    Arguments as in :func:`render_guidance`.
     """
     colors = gbuffer.images(shade_surface(gbuffer, arriving, lighting, background, estimation.brdf))
     buffers = gbuffer.numpy()
@@ -306,11 +305,11 @@ def averaged(image: np.ndarray, times: int) -> np.ndarray:
 
 
 def averaged_surface(gbuffer: dict[str, np.ndarray], times: int) -> dict[str, np.ndarray]:
-    """A G-buffer of sub-pixels -> of pixels, by what each field is.
+    """Average a G-buffer of sub-pixels to pixels, each field by its own rule.
 
     Opacity and the premultiplied ``rgb`` are means. Base color, roughness, metallic, position and other
-    values are means by opacity, as compositing along one ray has them, and 0 where it is 0. Normal and
-    direction are brought back to unit length. Depth is the mean by opacity of the sub-pixels that have one.
+    values are opacity-weighted means, as in compositing along one ray, and 0 where opacity is 0. Normal and
+    direction are normalised again. Depth is the opacity-weighted mean of the sub-pixels that have one.
 
     Args:
         gbuffer: ``GBuffer.numpy()``, (H times, W times, ...) each.
@@ -333,9 +332,9 @@ def _mean(image: np.ndarray, weight: np.ndarray, times: int) -> np.ndarray:
     return averaged(image * weight, times) / np.where(total > 0, total, 1)
 
 
-# Guidance under a light is sampled once a pixel, since shadow rays are dear; camera rays are not. These maps
-# are means over 2 x 2 sub-pixels, so that a network that is given them can tell a texture from noise and how
-# much of a pixel an edge covers.
+# Guidance under a light is sampled once per pixel, because shadow rays are expensive; camera rays are cheap.
+# These maps are means over 2 x 2 sub-pixels, from which a network can tell texture from noise and how much of
+# a pixel an edge covers.
 
 SUB_PIXELS = 2
 """Sub-pixels along a pixel's side."""
@@ -344,17 +343,17 @@ SUB_PIXELS = 2
 def surface_maps(
     tracer: ViewTracer, camera: Camera, estimations: Sequence[Estimation]
 ) -> list[dict[str, np.ndarray]]:
-    """Members that no light changes of one view, one set an estimation of the light.
+    """The members of one view that do not depend on the light, one set per estimation.
 
     Each is (H, W, 3) float32 in [0, 1], a mean over sub-pixels:
 
         albedo      linear base color, by opacity: 0 where no surfels are
-        surface     likewise |n . v| of unit normal and direction to the camera, roughness, metallic
+        surface     |n . v| of unit normal and direction to the camera, roughness, metallic; by opacity
         sampling    a third if filtered and two if of sub-pixels; log2 of the shadow rays a pixel over
                     MOST_RAYS of tron.estimation; log2 of the pixel's footprint, distance / fx, over the
                     scene's surfel spacing, OCTAVES of tron.estimation as 0 to 1, and 1 where no surfels are
 
-    With ``sampling`` a network knows what the light's noise and the surfels' blur are like.
+    ``sampling`` tells a network how strong the light's noise and the surfels' blur are.
     """
     fine = camera.resized(SUB_PIXELS * camera.width, SUB_PIXELS * camera.height)
     seen = tracer.gbuffer(fine).numpy()

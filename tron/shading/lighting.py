@@ -1,4 +1,4 @@
-"""An environment made ready to light frames: what is drawn from, and what is looked up.
+"""An environment prepared for lighting frames: importance sampling and prefiltered lookups.
 
 Split-sum lighting is a prefiltered environment times a BRDF table (Karis 2013), in nvdiffrec's convention.
 The prefiltered cubemap has one level for each of a few roughnesses, from 0.08 at full resolution to 0.5 at 32
@@ -36,7 +36,7 @@ class Lighting:
     """An environment prepared once for every frame that it lights.
 
     Args:
-        environment: the light; of a cubemap everything is differentiable by its texels.
+        environment: the light; with a cubemap, everything is differentiable by its texels.
         cubemap_resolution: see :class:`SplitSum`.
     """
 
@@ -49,7 +49,7 @@ class Lighting:
 
     @property
     def environment(self) -> EnvironmentMap:
-        """The light as a map, turned as it is."""
+        """The light as a map, its rotation included."""
         light = self.light
         return light.to_environment() if isinstance(light, CubemapLight) else light.environment
 
@@ -125,9 +125,9 @@ class SplitSum:
         return self._level(self._at_rest(mi.Vector3f(normal)), self._last + 1)
 
     def reflected(self, normal: mi.Vector3f, to_camera: mi.Vector3f, roughness: mi.Float) -> mi.Color3f:
-        """Mean radiance over the unoccluded lobe, along the mirror's direction as the paper looks it up.
+        """Mean radiance over the unoccluded lobe, looked up along the mirror's direction as in the paper.
 
-        Times F0 A + B it is the specular reflection; rough lobes are elsewhere (:meth:`averaged`).
+        Times F0 A + B it is the specular reflection; :meth:`averaged` is more accurate for rough lobes.
 
         Args:
             normal, to_camera: unit, world.
@@ -139,8 +139,8 @@ class SplitSum:
     def averaged(self, parts: Sequence[tuple[mi.Float, mi.Vector3f]]) -> mi.Color3f:
         """Mean linear radiance over a lobe of :func:`tron.brdf.reflectance.lobe_parts`.
 
-        Each part is looked up where the lobe of a level has the same first moment. That is neither along the
-        mirror's direction nor of the surface's roughness: lobes lean to the normal, the horizon cuts them.
+        Each part is looked up in the direction and level whose lobe has the same first moment. These differ
+        from the mirror's direction and the surface's roughness: lobes lean to the normal, cut by the horizon.
         """
         looked_up = []
         for share, mean in parts:

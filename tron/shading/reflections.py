@@ -1,25 +1,25 @@
-"""Mirror images of the scene in glossy surfaces: rays of each pixel's lobe that meet it or escape.
+"""Reflections of the scene in glossy surfaces: rays of each pixel's lobe that meet the scene or escape.
 
-Half vectors are drawn from the normals that the view v sees (Heitz 2018, "Sampling the GGX Distribution of
-Visible Normals"). Of the directions l that they mirror, one is kept with the probability G_2(v, l) / G_1(v),
-that no other facet stops it (:mod:`tron.brdf.microfacets`); else another is drawn. So rays have the density
-p(l) = D(h) G_2(v, l) / (4 n.v e), where e is the albedo of a perfect mirror, and all the same weight but for
-Fresnel's share F. With L the environment's radiance, V its visibility and R what a surfel sends back,
+Half vectors are drawn from the normals visible to the view v (Heitz 2018, "Sampling the GGX Distribution of
+Visible Normals"). A mirrored direction l is kept with the probability G_2(v, l) / G_1(v) that no other facet
+blocks it (:mod:`tron.brdf.microfacets`); otherwise another is drawn. So rays have the density
+p(l) = D(h) G_2(v, l) / (4 n.v e), where e is the albedo of a perfect mirror, and equal weights except for
+Fresnel's share F. With L the environment's radiance, V its visibility and R the radiance of a surfel,
 
-    M = e / (n ks) sum_met F R               mean radiance over the lobe of what is met
+    M = e / (n ks) sum_met F R               mean over the lobe of the radiance that is met
     o = sum m F L V / sum m F L              share of the environment's light that escapes
 
-by channel, of n rays. The split sum, which has no noise, keeps the light, the rays decide how much of it is
-hidden. o is taken from as many rays again that are drawn from the light: few of the lobe's see a sun, whose
-highlight would stand in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of
-both kinds. A pixel has few rays: were they drawn by the normals alone and weighed afterwards, in a white
-bowl of rough metal a tenth of the light would be missing. And the ratio of a few rays is not right in the
-mean: what the rougher lobes find is averaged over the pixels about before it is divided.
+by channel, over n rays. The noiseless split sum gives the light; the rays only decide how much of it is
+hidden. o also uses as many rays drawn from the light: few of the lobe's rays see a sun, and its highlight
+would remain in shadows. m = p / (p + p_light) is the balance heuristic (Veach 1997), for rays of both kinds.
+A pixel has few rays: if they were drawn by the normals alone and weighted afterwards, a tenth of the light
+would be missing in a white bowl of rough metal. And a ratio of few rays is biased, so the sums of rougher
+lobes are averaged over neighbouring pixels before the division.
 
-A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the composition of
-:mod:`tron.shading.composition` at the surfel's centre with the bake's light, so a mirror shows highlights of
-what it mirrors. A back face shows what ``BouncedLight.behind`` says. Where a metal is met, one ray of its own
-lobe goes on; what that meets has the bake's light alone.
+A ray of the lobe is stopped by one surfel (:mod:`tron.tracing.hierarchy.first_hit`). R is the radiance by
+:mod:`tron.shading.composition` at the surfel's centre with the baked light, so reflected surfaces show their
+highlights. A back face has the radiance ``BouncedLight.behind``. Where a metal is met, one ray of its own
+lobe is traced further; the surfel that it meets has the baked light only.
 """
 
 from __future__ import annotations
@@ -50,28 +50,28 @@ if TYPE_CHECKING:
 
 
 TRIALS = 8
-"""Directions drawn for a ray: of the roughest lobes one in a hundred keeps none, and takes the likeliest."""
+"""Directions tried per ray; in the roughest lobes one ray in a hundred keeps none and takes the likeliest."""
 SMOOTHEST = 0.02
-"""Least roughness of the rays: below, a lobe is narrower than float32 can draw."""
+"""Least roughness of the rays: a narrower lobe cannot be sampled in float32."""
 EVEN = (0.6, 0.9)
-"""Roughness up to which a metal that is met sends a ray on, and from which on bounced light is as good."""
+"""Roughness up to which a metal that is met traces a further ray, and above which bounced light is used."""
 ROUGHER = 0.5
-"""Share of a lobe's alpha by which what it meets looks the environment up more roughly. A few rays of a rough
-floor seldom find the sun in a polished ball, and are white specks where they do (Kaplanyan and Dachsbacher
-2013, "Path Space Regularization for Holistic and Robust Light Transport")."""
+"""Share of a lobe's alpha by which the surface it meets is roughened for looking up the environment. A rough
+floor's few rays seldom find the sun in a polished ball, and give white specks where they do (Kaplanyan and
+Dachsbacher 2013, "Path Space Regularization for Holistic and Robust Light Transport")."""
 ROUGH = 0.2
-"""Roughness from which on neighbours' rays count in full; a mirror keeps its own."""
+"""Roughness above which neighbours' rays count in full; a mirror uses only its own."""
 UNLIKE = 10.0
 """Inverse of the difference in roughness at which a neighbour counts for 1 / e."""
 
 
 @dataclass
 class Mirror:
-    """The view of a lobe, one lane a pixel, by channel.
+    """The light in a lobe, one lane per pixel, by channel.
 
     Attributes:
-        openness: o, share of the environment's light that escapes.
-        radiance: M, mean over the lobe of what is met, linear.
+        openness: o, share of the environment's light that is not occluded.
+        radiance: M, mean over the lobe of the radiance that is met, linear.
     """
 
     openness: mi.Color3f
@@ -88,19 +88,19 @@ def reflections(
     brdf: Brdf = "conserving",
     where: mi.Bool | bool = True,
 ) -> Mirror:
-    """The view of each pixel's lobe.
+    """Trace the lobe of each pixel.
 
-    Rays stand still where the surface is differentiated, and what they find is a constant.
+    Rays and their results are constants when the surface is differentiated.
 
     Args:
         tracer: the scene.
         gbuffer: the pixels.
         lighting: the prepared environment.
-        bounce: what it is at each surfel.
-        rays: of each pixel.
+        bounce: its light baked at each surfel.
+        rays: per pixel.
         seed: root of their random numbers.
         brdf: the model of the material.
-        where: the pixels that send any.
+        where: the pixels to trace rays from.
     """
     with dr.suspend_grad():
         points = PixelPoints.make(rays, 2, gbuffer.width, seed, "reflections")
@@ -156,7 +156,7 @@ def reflections(
 
 
 def _pooled(sums: dict[str, mi.Color3f], seen: mi.Bool, gbuffer: GBuffer, spacing: float) -> Mirror:
-    """Findings of a pixel, and of its neighbours where it is rough: the rougher, the more they count."""
+    """Pool the sums of a pixel with its neighbours': the rougher the pixel, the more they count."""
     own = [dr.select(seen, value, 0) for color in sums.values() for value in color]
     own.append(dr.select(seen, mi.Float(1), 0))
     dr.eval(own)
@@ -169,7 +169,7 @@ def _pooled(sums: dict[str, mi.Color3f], seen: mi.Bool, gbuffer: GBuffer, spacin
 
 @dataclass
 class Lobe:
-    """GGX as a view sees it, one lane a pixel.
+    """The GGX lobe towards a view, one lane per pixel.
 
     Attributes:
         frame: about the normal.
@@ -205,7 +205,7 @@ class Lobe:
             out, best = dr.select(better, mirrored, out), dr.select(better, share, best)
             chance, *fresh = [mi.sample_tea_float32(bits[0], bits[1] + 3 * trial + k) for k in range(3)]
             out, kept = dr.select(~kept & (chance < share), mirrored, out), kept | (chance < share)
-            u = mi.Point2f(*fresh)  # the first alone is of the pixel's own points
+            u = mi.Point2f(*fresh)  # only the first trial uses the pixel's own points
         return self.frame.to_world(out), out.z > 0
 
     def density(self, out: mi.Vector3f) -> mi.Float:
@@ -224,7 +224,7 @@ def ray_weights(
     brdf: Brdf,
     layers: Layers | None,
 ) -> tuple[mi.Color3f, mi.Color3f, mi.Color3f]:
-    """F, m F and L of rays along ``direction``, however they were drawn; F is 0 where inactive."""
+    """F, m F and L of rays along ``direction``, drawn either way; F is 0 where inactive."""
     out = lobe.frame.to_local(direction)
     facing = dr.dot(lobe.view, dr.normalize(out + lobe.view))
     weight = dr.select(active & (out.z > 0) & (facing > 0), fresnel(material, facing, brdf, layers), 0)
@@ -244,10 +244,10 @@ def _returned(
     seeds: mi.UInt32 | None = None,
     wide: mi.Float | None = None,
 ) -> mi.Color3f:
-    """Radiance that what is met sends back along ``direction``; 0 where nothing is.
+    """Radiance of the met surfels back along ``direction``; 0 where nothing is met.
 
-    ``seeds``: of the rays that metals which are met send on; None: they send none. ``wide``: alpha of the
-    lobe that the ray is of (:data:`ROUGHER`); None: the environment is looked up as what is met is.
+    ``seeds``: of the further rays traced by metals that are met; None: none. ``wide``: alpha of the ray's own
+    lobe (:data:`ROUGHER`); None: the met surface is not roughened.
     """
     met = hit.surfel != NOTHING
     front = met & hit.front
@@ -288,9 +288,9 @@ def _mirrored(
     brdf: Brdf,
     seeds: mi.UInt32,
 ) -> Mirror:
-    """The view of the lobes of ``surfel`` along ``direction``, of one ray each; nothing where inactive.
+    """The light in the lobes of ``surfel`` along ``direction``, by one ray each; 0 where inactive.
 
-    Of the environment what the ray says escapes, of a rough lobe what reaches the surfel: ``visibility``.
+    The ray decides how much of the environment is seen; in a rough lobe, the surfel's ``visibility`` does.
     """
     lane = dr.compress(active)
     surface = centres(tracer.records, dr.gather(mi.UInt32, surfel, lane))
@@ -318,15 +318,15 @@ def _mirrored(
     return found
 
 
-# A metal shows nothing but reflections, so the bounced light around it will not do: a room of metal is 1.02,
-# 1.17 and 1.51 of the truth by channel, with one ray 0.89, 0.96 and 1.10. Other surfaces keep that light, and
-# scenes without metals cost nothing.
+# A metal shows reflections only, so bounced light from all directions is too crude: a room of metal has 1.02,
+# 1.17 and 1.51 of the true light by channel, with one ray 0.89, 0.96 and 1.10. Other surfaces keep
+# that light, and scenes without metals cost nothing.
 
 RAYS = 1
 
 
 def metal_share(surface: Surface) -> mi.Float:
-    """Weight in [0, 1] of the rays' findings: 0 up to a metallic of one half, then linear."""
+    """Weight in [0, 1] of the rays' results: 0 up to a metallic of one half, then linear."""
     return dr.clip(2 * surface.metallic - 1, 0, 1)
 
 
@@ -338,7 +338,7 @@ def metal_reflections(
     estimation: Estimation,
     seed: int,
 ) -> Mirror | None:
-    """The view of each metal pixel's lobe, of few rays; None where there is no metal."""
+    """The light in each metal pixel's lobe, by few rays; None if there is no metal."""
     metal = (gbuffer.opacity > 0) & (metal_share(gbuffer) > 0)
     if not dr.any(metal):
         return None
@@ -346,7 +346,7 @@ def metal_reflections(
 
 
 def with_mirror(even: Bounced, mirror: Mirror, share: mi.Float) -> Bounced:
-    """Light that bounced; by ``share``, such as :func:`metal_share`, surfaces show what their rays found."""
+    """Blend reflection rays' results into bounced light by ``share``, such as :func:`metal_share`."""
     return Bounced(
         even.indirect,
         dr.lerp(even.openness, mirror.openness, share),

@@ -1,6 +1,6 @@
-"""The gradient of compositing: the stored hits of each ray are replayed, with one running scalar.
+"""The gradient of compositing: the stored hits of each ray are replayed with one running scalar.
 
-With ``g`` the gradient of the sums ``F = sum_i w_i f_i`` and ``g_T`` that of the final transmittance T, let
+With ``g`` the gradient of the sums ``F = sum_i w_i f_i`` and ``g_T`` the gradient of the final T, let
 
     rest_i = sum_{j > i} w_j (g . f_j) + g_T T
 
@@ -46,7 +46,7 @@ _RECORDS = ("geometry", "features", "harmonics", "values")
 
 @dataclass
 class _Gradients:
-    """Sums of gradients, laid out as the records are; None for records that need none."""
+    """Sums of gradients in the layout of the records; None for records that need none."""
 
     geometry: mi.Float | None
     features: mi.Float | None
@@ -56,7 +56,7 @@ class _Gradients:
 
 @dataclass
 class _Replay:
-    """The forward pass as the adjoint needs it, all of it detached."""
+    """What the adjoint needs of the forward pass, detached."""
 
     records: SurfelRecords
     origin: mi.Point3f
@@ -68,7 +68,7 @@ class _Replay:
 
 
 def has_gradients(records: SurfelRecords, direction: mi.Vector3f) -> bool:
-    """Whether sums over these records, seen along ``direction``, have anything to be differentiated by."""
+    """Whether the records or ``direction`` have gradients enabled."""
     view = records.sh_degree > 0 and dr.grad_enabled(direction)
     return view or any(_differentiable(records, name) for name in _RECORDS)
 
@@ -84,14 +84,14 @@ def attach(
     direction: mi.Vector3f,
     hits: list[Iterable[HitList]],
 ) -> Composite:
-    """Give sums traced without gradients their derivatives by the records and by SH's view direction.
+    """Attach derivatives by the records and SH's view direction to sums traced without gradients.
 
-    Nothing happens, and nothing is paid, where neither ``records`` nor ``direction`` have gradients. The
-    direction is differentiated in the radiance only: the rays themselves stand still.
+    Does nothing, at no cost, if neither ``records`` nor ``direction`` have gradients. The direction is
+    differentiated in the radiance only; the rays themselves are constant.
 
     Args:
-        sums: of each ray, evaluated. records: what they were traced from.
-        origin, direction: the rays. hits: of theirs, each ray on one list, for each backward pass.
+        sums: of each ray, evaluated. records: the surfels that were traced.
+        origin, direction: the rays. hits: the rays' hit lists, one list per ray, read by each backward pass.
     """
     if not has_gradients(records, direction):
         return sums
@@ -106,7 +106,7 @@ def attach(
 
 
 class _Compositing(dr.CustomOp):
-    """Records and the SH basis but its constant -> (channels, mean depth, transmittance)."""
+    """Records and the non-constant SH basis -> (channels, mean depth, transmittance)."""
 
     def eval(self, geometry: Any, features: Any, harmonics: Any, values: Any, basis: Any, replay: Any) -> Any:
         del geometry, features, harmonics, values  # their values are in the sums already
@@ -122,7 +122,7 @@ class _Compositing(dr.CustomOp):
             rest = dr.fma(gradient, value, rest)
         has_gradient = tuple(not _silent(group) for group in _groups(channels))
         dr.eval(channels, mean_depth, rest)
-        # Those that nobody asked for, such as the geometry's once it is frozen, cost nothing.
+        # Gradients that are not needed, such as those of frozen geometry, cost nothing.
         out = _Gradients(
             **{
                 name: dr.zeros(mi.Float, _capacity(dr.width(getattr(records, name))))
@@ -154,21 +154,21 @@ class _Compositing(dr.CustomOp):
 
 
 def _capacity(numbers: int) -> int:
-    """Capacity for ``numbers`` numbers that other numbers share: a quarter of their octave is rounded up.
+    """Round ``numbers`` up to a quarter of its octave.
 
-    Dr.Jit writes the width of what is added to by copies into the kernel, and each width is compiled anew.
+    Dr.Jit compiles the width of an array with per-thread copies into the kernel: fewer widths, fewer kernels.
     """
     step = max(1, (1 << (numbers - 1).bit_length()) >> 3)
     return -(-numbers // step) * step
 
 
 def _silent(gradients: list[mi.Float]) -> bool:
-    """Whether a loss left these outputs out: what it did not use stands for is never read, nor added to."""
+    """Whether a loss does not use these outputs; their records are then neither read nor added to."""
     return all(g.state == dr.VarState.Literal and g[0] == 0 for g in gradients)
 
 
 def _groups(channels: list[mi.Float]) -> list[list[mi.Float]]:
-    """Channels as packets hold them: two of materials, radiance, and packets of values."""
+    """Channels grouped as in packets: two of materials, radiance, and packets of values."""
     ends = [0, 4, 8, CHANNELS, *range(CHANNELS + 4, len(channels) + 4, 4)]
     return [channels[first:last] for first, last in pairwise(ends)]
 
@@ -181,10 +181,10 @@ def _add(target: mi.Float | None, packet: mi.UInt32, values: list[mi.Float], act
 
 
 def _reduction(numbers: int) -> dr.ReduceMode:
-    """Mode of adding to ``numbers`` numbers: on CPUs, to a copy of each thread's, where these fit in memory.
+    """Mode of adding to ``numbers`` numbers: on CPUs, into a copy per thread, if these fit in memory.
 
-    Left to itself, Dr.Jit stops making copies at a million numbers, which is 22,000 surfels' harmonics, and
-    takes two to five times as long from there on.
+    By default, Dr.Jit stops making copies at a million numbers (the harmonics of 22,000 surfels) and takes
+    two to five times as long beyond.
     """
     if dr.backend_v(mi.Float) != dr.JitBackend.LLVM:
         return dr.ReduceMode.Auto
@@ -204,10 +204,10 @@ def _replay(
         records, origin, direction, basis: as in the forward pass, one lane a list.
         hits: the lists.
         outer, outer_depth: gradients of the channels and of the mean depth.
-        rest: sum of outer gradients times what they belong to (module docstring).
+        rest: the running scalar of the module docstring.
         out: receives the gradients of the records.
-        has_gradient: of each of :func:`_groups`, whether any channel has a gradient at all.
-        functions: how many basis functions, from the second on, to differentiate by.
+        has_gradient: for each of :func:`_groups`, whether any channel has a gradient.
+        functions: number of basis functions, from the second on, to differentiate by.
 
     Returns:
         Gradients of the basis functions.
@@ -256,8 +256,8 @@ def _replay_radiance(
     records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], weight: mi.Float, outer: list[mi.Float],
     by_basis: list[mi.Float], out: _Gradients, active: mi.Bool,
 ) -> tuple[list[mi.Float], list[mi.Float]]:  # fmt: skip
-    """Radiance of one surfel and the basis gradients so far; its own gradients go to ``out``."""
-    if records.sh_degree == 0:  # clipping is differentiated where packing evaluates it
+    """Add one surfel's radiance gradients to ``out``; return its radiance and the basis gradients so far."""
+    if records.sh_degree == 0:  # packing evaluates and differentiates the clipping
         at = index * FEATURE_PACKETS + MATERIAL_PACKETS
         packed = dr.gather(mi.Vector4f, records.features, at, active)
         _add(out.features, at, [*[weight * value for value in outer], mi.Float(0)], active)
@@ -285,7 +285,7 @@ def _replay_hit(
     records: SurfelRecords, index: mi.UInt32, hit: SurfelHit, direction: mi.Vector3f,
     by_alpha: mi.Float, by_t: mi.Float, out: _Gradients, active: mi.Bool,
 ) -> None:  # fmt: skip
-    """Gradients of a geometry record from those of alpha and t: ``kernel.intersect`` in reverse.
+    """Gradients of a geometry record from the gradients of alpha and t: ``kernel.intersect`` in reverse.
 
     t = n . c / (n . d) with n = a x b and c from the origin to the centre; the offset is t d - c.
     """
@@ -311,7 +311,7 @@ def _replay_hit(
 def _by_centre(
     filtered: Filtered, pixel: mi.Vector3f, direction: mi.Vector3f, by_q: mi.Float, by_t: mi.Float
 ) -> mi.Vector3f:
-    """Gradient of a centre c from those of q and t where a pixel's filter counts.
+    """Gradient of a centre c from the gradients of q and t, where the pixel's filter is what is hit.
 
     With z = pixel . c, e = d / (pixel . d) and g = e - c / z, q = g^2 and t = z / (pixel . d).
     """

@@ -1,8 +1,8 @@
 """Front-to-back compositing of sorted hits: ``sum_i T_i alpha_i f_i``, ``T_i = prod_{j<i} (1 - alpha_j)``.
 
 (Equation 3 of the TRON paper; conventions.md, 7.) Compositing ends at the first hit after which T is
-below 0.001. The ids of the composited hits are written out in order, so that the adjoint can replay exactly
-this list.
+below 0.001. The ids of the composited hits are written out in order, so that the adjoint replays the same
+list.
 """
 
 from __future__ import annotations
@@ -20,20 +20,20 @@ from tron.tracing.kernel import FEATURE_PACKETS, MIN_ALPHA, SH_PACKETS, SurfelRe
 STOP_TRANSMITTANCE = 1e-3
 MEDIAN_TRANSMITTANCE = 0.5
 BEGIN_TRANSMITTANCE = 0.9
-"""Transmittance below which a surface has begun: a scan's fog before it lifts it off its median."""
+"""Transmittance below which a surface has begun; in a scan with fog, that is well before its median."""
 APART = 0.7
-"""Mean cosine to the normals of a ray's first hits below which a hit is of another face."""
+"""Least mean cosine between a hit's normal and those of the ray's first hits on the same face."""
 NO_SURFEL = 0xFFFFFFFF
 MOST_HITS = ceil(log(STOP_TRANSMITTANCE) / log(1 - MIN_ALPHA)) + 1
-"""Most hits that any ray composites, one of them for rounding: 1764 of the faintest stop it."""
+"""Most hits that a ray composites: 1764 of the faintest stop it, and one more allows for rounding."""
 CHANNELS = 11
 MATERIAL_PACKETS = 2
-"""Packets of a feature record that are composited as they are: normal, roughness | base color, metallic."""
+"""Packets of a feature record that are composited unchanged: normal, roughness | base color, metallic."""
 
 
 @dataclass
 class HitList:
-    """The composited hits of some rays, as the adjoint replays them.
+    """The composited hits of some rays, which the adjoint replays.
 
     Attributes:
         ids: mi.UInt32, surfels, slot-major: slot ``s`` of list ``r`` lies at ``s * width(ray) + r``.
@@ -47,7 +47,7 @@ class HitList:
 
     @staticmethod
     def empty(ray: mi.UInt32, capacity: int) -> HitList:
-        """Lists of up to ``capacity`` hits for the rays ``ray``.
+        """Empty lists of up to ``capacity`` hits for the rays ``ray``.
 
         Raises:
             TronError: more than 32-bit indices can address.
@@ -75,9 +75,9 @@ class HitList:
 
 @dataclass
 class HitRows:
-    """The memory of a :class:`HitList`, as a kernel sees it: its sizes are variables.
+    """The memory of a :class:`HitList` inside a kernel, with sizes as variables.
 
-    Literals would compile a kernel for each size of image.
+    Literals would compile a kernel for each image size.
 
     Attributes:
         ids: mi.UInt32. lane: mi.UInt32, 0, 1, .. one a list.
@@ -97,12 +97,12 @@ class Composite:
     Attributes:
         channels: 11 floats: normal, roughness, base color, metallic, rgb of SH radiance; then the records'
             values.
-        front: 4 floats: sum of ``w n`` of the hits that face as the first do (:data:`APART`), and of ``w``.
-        first, other: the first surfel, and the first that faces otherwise; ``NO_SURFEL`` if there is none.
+        front: 4 floats: sums of ``w n`` and ``w`` over the hits on the first hits' face (:data:`APART`).
+        first, other: the first surfel, and the first of another face; ``NO_SURFEL`` if there is none.
         mean_depth: sum of ``w t``.
         transmittance: T after the last composited hit.
         median: the surfel after which T < 0.5 first; ``NO_SURFEL`` where T stays above.
-        begin: the surfel after which T < 0.9 first; likewise.
+        begin: the surfel after which T < 0.9 first; ``NO_SURFEL`` where T stays above.
         count: composited hits.
     """
 
@@ -118,7 +118,7 @@ class Composite:
 
     @staticmethod
     def start(values: int = 0) -> Composite:
-        """Nothing hit yet, of surfels with so many more values."""
+        """Initial sums, nothing hit yet, for surfels with ``values`` further values."""
         channels, front = ([mi.Float(0) for _ in range(count)] for count in (CHANNELS + values, 4))
         none = [mi.UInt32(NO_SURFEL) for _ in range(4)]
         return Composite(channels, front, mi.Float(0), mi.Float(1), *none, mi.UInt32(0))
@@ -127,7 +127,7 @@ class Composite:
 def harmonic_sums(
     records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], active: mi.Bool
 ) -> tuple[list[mi.Vector4f], list[mi.Float]]:
-    """An SH record's packets in use, and ``SH(d) + 0.5`` for red, green and blue.
+    """The used packets of an SH record, and ``SH(d) + 0.5`` for red, green and blue.
 
     ``basis`` is :func:`tron.gaussians.harmonics.sh_basis` of d.
     """
@@ -146,7 +146,7 @@ def radiance(
     records: SurfelRecords, index: mi.UInt32, basis: list[mi.Float], active: mi.Bool
 ) -> list[mi.Float]:
     """Display-space radiance ``max(0, SH(d) + 0.5)`` of one surfel: red, green, blue."""
-    if records.sh_degree == 0:  # the same from everywhere: packing has evaluated it
+    if records.sh_degree == 0:  # independent of direction: packing has evaluated it
         packed = dr.gather(mi.Vector4f, records.features, index * FEATURE_PACKETS + MATERIAL_PACKETS, active)
         return [packed[0], packed[1], packed[2]]
     _, total = harmonic_sums(records, index, basis, active)
@@ -154,7 +154,7 @@ def radiance(
 
 
 def values_of(records: SurfelRecords, index: mi.UInt32, active: mi.Bool) -> list[mi.Vector4f]:
-    """The packets of one surfel's values, the last filled up; none where the records have no values."""
+    """The packets of one surfel's values, the last one padded; empty if the records have no values."""
     packets = value_packets(records.value_count)
     return [
         dr.gather(mi.Vector4f, records.values, index * packets + packet, active) for packet in range(packets)
@@ -165,14 +165,14 @@ def values_of(records: SurfelRecords, index: mi.UInt32, active: mi.Bool) -> list
 def composite(
     records: SurfelRecords, hits: LocalHits, basis: list[mi.Float], sums: Composite, out: HitRows | None
 ) -> Composite:
-    """Composite the sorted ``hits`` of each lane behind what ``sums`` holds already.
+    """Composite the sorted ``hits`` of each lane behind those already in ``sums``.
 
     Args:
         records: the surfels.
         hits: sorted local hits, in the same kernel; all of them lie behind those in ``sums``.
         basis: spherical harmonics at the unit ray direction (3DGRT evaluates SH there).
-        sums: what was composited before; :meth:`Composite.start` at first.
-        out: receives the ids, list r from lane r, as many as it has room for; the caller evaluates it.
+        sums: the sums so far; :meth:`Composite.start` at first.
+        out: receives the ids, list r from lane r, as many as fit; the caller evaluates it.
     """
     slot = mi.UInt32(0)
     active = (slot < hits.count) & (sums.transmittance >= STOP_TRANSMITTANCE)

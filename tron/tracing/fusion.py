@@ -1,8 +1,8 @@
-"""Depth maps of many views fused into one field of signed distances, and the surface that they agree on.
+"""Fusion of many views' depth maps into one truncated signed distance field, and the surface they agree on.
 
 From "A Volumetric Method for Building Complex Models from Range Images" (Curless and Levoy 1996): each view
-says how far a voxel lies before (positive) or behind (negative) the surface that it sees, cut off at some
-voxels; the mean over the views crosses zero on the surface. Voxels that a mask shows to be empty are free.
+gives a voxel's distance before (positive) or behind (negative) the surface that it sees, truncated at a few
+voxels; the mean over the views crosses zero on the surface. Voxels outside a view's mask are empty.
 One kernel runs over all voxels, and within each over the views: 64 views of 200 x 200 take 0.3 s.
 """
 
@@ -27,21 +27,21 @@ _BLOCK = 4
 _SAMPLED = 1 << 20
 _STEPS = 4
 _STRIDE = 0.8
-_CLOSE = 0.25  # of the reach: farther from zero no surface was met
-_STEEP = 0.15  # of a full slope: flatter fields have no direction
+_CLOSE = 0.25  # of the reach: values farther from zero are no surface
+_STEEP = 0.15  # of a full slope: flatter fields have no normal
 _SEEN = 0.5
 _CAMERA, _SIZE = 19, 3
 
 
 @dataclass(frozen=True, eq=False)
 class DepthMap:
-    """Distances that one view knows.
+    """The depth map of one view.
 
     Attributes:
         camera: the view.
         depth: (H, W) distance along the ray, world units; 0 where there is none.
-        weight: (H, W) what each pixel counts in the fusion, 0 and up.
-        empty: (H, W) bool, rays that meet nothing, or None where that is not known (see :func:`empty_rays`).
+        weight: (H, W) weight of each pixel in the fusion, 0 or more.
+        empty: (H, W) bool, rays that meet nothing (see :func:`empty_rays`), or None if that is not known.
     """
 
     camera: Camera
@@ -50,7 +50,7 @@ class DepthMap:
     empty: np.ndarray | None = None
 
     def points(self) -> np.ndarray:
-        """(N, 3) float64 of the pixels that count, world."""
+        """(N, 3) float64 surface points of the pixels with weight, world."""
         counts = (self.depth > 0) & (self.weight > 0)
         return self.camera.position + self.depth[counts][:, None] * self.camera.rays()[counts]
 
@@ -60,11 +60,11 @@ class DistanceField:
     """Truncated signed distances on a grid.
 
     Attributes:
-        low: (3,) world, of the first voxel's centre.
+        low: (3,) world, centre of the first voxel.
         voxel: edge of a voxel, world units.
-        reach: distance at which values are cut off, world units.
-        value: (X, Y, Z) float32 in [-1, 1], distance over reach; 1 where nothing was seen.
-        weight: (X, Y, Z) float32, sum of what was seen.
+        reach: distance at which values are truncated, world units.
+        value: (X, Y, Z) float32 in [-1, 1], distance over reach; 1 in unseen voxels.
+        weight: (X, Y, Z) float32, sum of the views' weights.
     """
 
     low: np.ndarray
@@ -74,7 +74,7 @@ class DistanceField:
     weight: np.ndarray
 
     def smoothed(self, sigma: float) -> DistanceField:
-        """Mean under a Gaussian of ``sigma`` voxels, cut off at four, weighted by what was seen."""
+        """Smooth by a Gaussian of ``sigma`` voxels, truncated at four sigma, weighted by ``weight``."""
         if sigma <= 0:
             return self
         weight, value = (
@@ -85,15 +85,15 @@ class DistanceField:
         return DistanceField(self.low, self.voxel, self.reach, value, weight)
 
     def closed(self, radius: int) -> DistanceField:
-        """Without pits, cracks and holes of no more than ``radius`` voxels to either side.
+        """Fill pits, cracks and holes of up to ``radius`` voxels to either side.
 
-        Morphological closing of what is solid, by a cube (Serra 1982), which leaves convex edges as they are.
+        Morphological closing of the solid by a cube (Serra 1982), which keeps convex edges.
         """
         value = grey_opening(self.value, 2 * radius + 1, mode="nearest")  # solid is negative
         return replace(self, value=np.where(self.weight > 0, value, self.value))
 
     def sampler(self) -> Sampler:
-        """The field on the device."""
+        """Upload the field to the device."""
         grids = mi.TensorXf(aligned(np.stack([self.value, self.weight], -1).astype(np.float32)))
         texture = mi.Texture3f(grids, use_accel=False, wrap_mode=dr.WrapMode.Clamp)
         low, size = _opaque(self.low), _opaque(np.array(self.value.shape))
@@ -102,7 +102,7 @@ class DistanceField:
 
 @dataclass(frozen=True, eq=False)
 class Sampler:
-    """A field between its voxels, trilinear; beyond the border that of the nearest (Dr.Jit)."""
+    """Trilinear lookup in a field; beyond the border, the nearest voxel's values (Dr.Jit)."""
 
     texture: Any
     low: mi.Point3f
@@ -117,7 +117,7 @@ class Sampler:
         return value, weight
 
     def gradient(self, point: mi.Point3f) -> mi.Vector3f:
-        """Central differences of the values over a voxel to either side, per world unit."""
+        """Gradient by central differences, one voxel to either side, per world unit."""
         parts = []
         for axis in range(3):
             step = mi.Vector3f(0)
@@ -127,35 +127,35 @@ class Sampler:
 
 
 def _opaque(three: np.ndarray) -> mi.Point3f:
-    """A variable: literals would compile a kernel for each of their values."""
+    """Make a number a variable: each value of a literal would compile its own kernel."""
     point = mi.Point3f(*(float(value) for value in three))
     dr.make_opaque(point)
     return point
 
 
 def pixel_footprint(maps: Sequence[DepthMap]) -> float:
-    """Median width that a pixel covers on the surface, world units; 0 where no depth is known."""
+    """Median width of a pixel on the surface, world units; 0 if no depth is known."""
     widths = np.concatenate([each.depth[each.weight > 0] / each.camera.fx for each in maps])
     return float(np.median(widths)) if len(widths) else 0.0
 
 
 def empty_rays(subject: np.ndarray) -> np.ndarray:
-    """(H, W) bool, rays that meet nothing: pixels with no pixel of the ``subject``, (H, W) bool, beside them.
+    """(H, W) bool, rays that meet nothing: pixels without a pixel of ``subject``, (H, W) bool, next to them.
 
-    A voxel is looked up in the nearest pixel, which beside a silhouette is one too far: without the margin
-    masks carve half a voxel off a ball (measured: depth 0.025 wrong instead of 0.004, voxels of 0.036).
+    A voxel is looked up in the nearest pixel, which may lie just outside a silhouette: without this margin,
+    masks carve half a voxel off a ball (depth error 0.025 instead of 0.004, voxels of 0.036).
     """
     return ~maximum_filter(subject, 3, mode="constant")
 
 
 def fuse(maps: Sequence[DepthMap], voxel: float, truncation: float, most_voxels: int) -> DistanceField | None:
-    """The field of some depth maps, or None where they hold no surface.
+    """Fuse depth maps into a field; None if they hold no surface.
 
     Args:
         maps: of all views.
-        voxel: wanted edge of a voxel, world units; larger where the scene would need more than
+        voxel: wanted edge of a voxel, world units; enlarged if the scene would need more than
             ``most_voxels`` along its longest side.
-        truncation: voxels at which distances are cut off.
+        truncation: distance at which values are truncated, voxels.
         most_voxels: see above.
     """
     every = max(sum(each.depth.size for each in maps) // _SAMPLED, 1)
@@ -185,7 +185,7 @@ def fuse(maps: Sequence[DepthMap], voxel: float, truncation: float, most_voxels:
 def _near(
     points: np.ndarray, low: np.ndarray, voxel: float, shape: np.ndarray, truncation: float
 ) -> np.ndarray:
-    """Flat indices of the voxels around the points, with room for the truncation and what blurs it."""
+    """Flat indices of the voxels around the points, within truncation and smoothing."""
     blocks = -(-shape // _BLOCK)
     place = ((points - low) / (voxel * _BLOCK)).astype(int)
     place = place[((place >= 0) & (place < blocks)).all(-1)]
@@ -255,7 +255,7 @@ def _summed(
 def fused_views(
     maps: Sequence[DepthMap], truncation: float, sigma: float, most_voxels: int
 ) -> list[tuple[np.ndarray, np.ndarray]]:
-    """The views' consensus on their own fused depths, as of :func:`consensus`; empty without a surface."""
+    """Fuse the views and return their :func:`consensus`; empty without a surface."""
     field = fuse(maps, pixel_footprint(maps), truncation, most_voxels)
     return [] if field is None else consensus(field, maps, sigma)
 
@@ -267,7 +267,7 @@ def consensus(
 
     Args:
         field: of the same maps.
-        maps: a walk begins at a view's own depth.
+        maps: the search along a ray begins at the view's own depth.
         sigma: of the Gaussian that smooths the field, voxels.
     """
     sampler = field.smoothed(sigma).sampler()

@@ -1,4 +1,4 @@
-"""Camera + scene -> GBuffer: one traced, composited and normalised surface point a pixel."""
+"""Camera + scene -> GBuffer: one traced, composited and normalised surface point per pixel."""
 
 from __future__ import annotations
 
@@ -39,9 +39,9 @@ from tron.tracing.tiled.tiles import (
 )
 
 KEPT_HITS = 128
-"""Most hits a ray for whose ids there is room at once, 4 bytes each."""
+"""Most hits per ray whose ids are stored, 4 bytes each."""
 FEW_HITS = 64
-"""The same where no tile list is longer."""
+"""Hits per ray whose ids are stored if no tile list is longer than this."""
 
 
 @dataclass
@@ -59,7 +59,7 @@ class GBuffer(Surface):
 
     @staticmethod
     def of_rows(surface: Surface, width: int, height: int) -> GBuffer:
-        """The G-buffer of pixels that come row by row."""
+        """Make a G-buffer from pixels in row-major order."""
         _, x, y, inside = tile_pixels(width, height)
         pixel = y * dr.opaque(mi.UInt32, width) + x
         tiled = dr.gather(dict, _held(surface), pixel, inside)
@@ -72,16 +72,16 @@ class GBuffer(Surface):
         return y * dr.opaque(mi.UInt32, self.width) + x
 
     def in_rows(self, values: Any) -> Any:
-        """Numbers of each lane (Dr.Jit, or a tree of it) -> of each pixel, row by row; differentiable."""
+        """Reorder values of lanes (Dr.Jit, or a tree of it) to pixels, row by row; differentiable."""
         lane = lanes_of_pixels(self.width, self.height)
         return dr.gather(type(values), values, lane, mode=dr.ReduceMode.Permute)
 
     def rows(self) -> Surface:
-        """The pixels row by row; differentiable."""
+        """The surface with one lane per pixel, row by row; differentiable."""
         return Surface(**{"values": []} | self.in_rows(_held(self)))
 
     def image(self, value: Any) -> np.ndarray:
-        """Numbers of each lane (Dr.Jit) as (H, W) or (H, W, C) float32."""
+        """Values of the lanes (Dr.Jit) as an image (H, W) or (H, W, C) float32."""
         return self.images({"value": value})["value"]
 
     def images(self, values: dict[str, Any]) -> dict[str, np.ndarray]:
@@ -91,19 +91,19 @@ class GBuffer(Surface):
         return {name: self._pixels(value) for name, value in values.items()}
 
     def numpy(self) -> dict[str, np.ndarray]:
-        """Every field as (H, W), (H, W, 3) or, where there are C ``values``, (H, W, C) float32."""
+        """Every field as (H, W) or (H, W, 3) float32; C ``values`` as (H, W, C)."""
         return self.images(_held(self))
 
     def _pixels(self, value: Any) -> np.ndarray:
         if isinstance(value, mi.Float):
             return np.array(value).reshape(self.height, self.width)
-        # One by one: together they would be laid one behind another by a kernel of every size's own.
+        # One by one: copying them together would compile a kernel for each size.
         channels = np.stack([np.array(channel) for channel in value], axis=-1)
         return channels.reshape(self.height, self.width, -1)
 
 
 def _held(surface: Surface) -> dict[str, Any]:
-    """The fields of a surface that hold something."""
+    """The fields of a surface that are set."""
     names = [f.name for f in fields(Surface) if f.name != "values" or surface.values]
     return {name: getattr(surface, name) for name in names if getattr(surface, name) is not None}
 
@@ -119,7 +119,7 @@ class TileRays:
 
 
 def tile_rays(camera: Camera) -> TileRays:
-    """Pixel-centre rays. The camera's numbers are opaque, or every view would compile its own kernel."""
+    """Rays through pixel centres. Camera numbers are opaque: literals would compile a kernel per view."""
     tile, x, y, inside = tile_pixels(camera.width, camera.height)
     fx, fy, cx, cy = (dr.opaque(mi.Float, float(v)) for v in (camera.fx, camera.fy, camera.cx, camera.cy))
     rotation = camera.camera_to_world[:3, :3]
@@ -139,25 +139,25 @@ def trace_tiles(
     keep_hits: bool,
     limit: mi.Float | None = None,
 ) -> tuple[Composite, list[Iterable[HitList]]]:
-    """Sums of every ray in tile order, and the hits that they are made of, if they are to be known.
+    """Composited sums of every ray in tile order and, if wanted, the lists of their hits.
 
-    Rays that streaming has no room for are traced once more, some hits at a time, without limit. If their
-    hits are too many to be kept, iteration finds them again.
+    Rays with more hits than streaming can hold are traced again, some hits at a time, without limit. If
+    these hits are too many to store, iterating over the lists finds them again.
 
     Args:
         records: the surfels, detached.
         lists: tile lists. rays: the rays of their pixels.
-        limit: distance of each ray beyond which no surfel counts, world units; None: there is none.
+        limit: distance of each ray beyond which no surfel counts, world units; None: no limit.
     """
     start = dr.gather(mi.UInt32, lists.start, rays.tile)
     count = dr.select(rays.inside, dr.gather(mi.UInt32, lists.count, rays.tile), 0)
     out = None
     if keep_hits:
-        # One of two sizes only: the kernel is recorded anew for each size of memory that is not written yet.
+        # Only two sizes: the kernel is recorded again for each size of unwritten memory.
         capacity = FEW_HITS if int(dr.max(lists.count)[0]) <= FEW_HITS else KEPT_HITS
         out = HitList.empty(dr.arange(mi.UInt32, dr.width(rays.tile)), capacity)
     sums, crowded, kept_hits = stream(
-        # Not how many surfels there are, which would be one more thing to record the kernel anew for.
+        # Without the number of surfels, for each of which the kernel would be recorded again.
         replace(records, count=0), lists.entries, lists.near, start, count, rays.origin, rays.direction,
         None if out is None else out.rows(), limit,
     )  # fmt: skip
@@ -222,15 +222,15 @@ def trace_gbuffer(
     return GBuffer(**vars(seen), width=camera.width, height=camera.height)
 
 
-# A list is sorted by a lower bound of distance, so what a ray has hit nearer than the next candidate's bound
-# is final: nothing to come lies before it. Each ray collects until it has ``MAX_HITS`` hits or its list ends,
-# sorts them, composites the final ones and keeps the others for the next round. Most rays need one round. It
-# fails only where as many hits as fit wait for candidates that might lie before all of them: surfels much
-# larger than the distances between them.
+# A list is sorted by a lower bound of distance, so a hit nearer than the next candidate's bound is final: no
+# later candidate lies before it. Each ray collects until it has ``MAX_HITS`` hits or its list ends, sorts
+# them, composites the final ones and keeps the others for the next round. Most rays need one round. It fails
+# only if ``MAX_HITS`` hits are held and a later candidate might lie before all of them, which takes surfels
+# much larger than the distances between them.
 
 
-# Tracing the sorting networks takes as long as 16,000 rays, so the kernel is recorded once for each kind of
-# arguments: degrees, number of values, whether hits are kept, and if so for how many. Other sizes are free.
+# Tracing this code with its sorting networks takes as long as 16,000 rays, so the kernel is recorded once for
+# each kind of arguments: degrees, number of values, whether and how many hits are kept. Array sizes may vary.
 @recorded
 def stream(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
@@ -242,12 +242,12 @@ def stream(
         records: the surfels, detached.
         entries, near: tile lists' ids and lower bounds of t; start, count: each ray's slice of them.
         origin, direction: world rays, unit directions.
-        out: receives the composited ids, list r from lane r, as many as it has room for.
-        limit: distance of each ray beyond which no surfel counts, world units; None: there is none.
+        out: receives the composited ids, list r from lane r, as many as fit.
+        limit: distance of each ray beyond which no surfel counts, world units; None: no limit.
 
     Returns:
-        All evaluated: the sums of each ray; whether it was not finished, or has more hits than there is room
-        for; and how many ids it has in ``out``, none where that is so.
+        All evaluated: the sums of each ray; whether the ray failed (unfinished, or more hits than ``out`` can
+        hold); and its number of ids in ``out``, 0 if it failed.
     """
     sums, crowded = _rounds(records, entries, near, Walk.along(start, count, limit), origin, direction, out)
     if out is not None:
@@ -306,7 +306,7 @@ def trace_view(
 
 
 def _joined(upper: GBuffer, lower: GBuffer) -> GBuffer:
-    """One view of two stripes, the upper one of whole tiles; differentiable."""
+    """Join two stripes to one view; the upper one consists of whole tiles; differentiable."""
 
     def join(above: Any, below: Any) -> Any:
         if above is None:

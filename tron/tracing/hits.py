@@ -1,6 +1,6 @@
-"""Sorted per-ray hit lists: walk a tile's candidates, keep what the ray meets, sort by distance.
+"""Sorted per-ray hit lists: walk a tile's candidates, keep the hits, sort them by distance.
 
-Visibility is settled here and is not differentiated; what follows (compositing) is.
+Visibility is decided here and is not differentiated; the compositing that follows is.
 """
 
 from __future__ import annotations
@@ -15,16 +15,16 @@ import mitsuba as mi
 from tron.tracing.kernel import T_MIN, SurfelRecords, intersect
 
 MAX_HITS = 64
-"""Hits that a ray keeps at a time until they are composited."""
+"""Most hits that a ray holds at a time before they are composited."""
 
 
 @dataclass
 class LocalHits:
-    """Hits of each lane in thread-local memory; alive inside one kernel only.
+    """Hits of each lane in thread-local memory; they exist inside one kernel only.
 
     Attributes:
         t, alpha: local arrays of mi.Float; index: of mi.UInt32. ``MAX_HITS`` slots and one for rejects.
-        count: mi.UInt32, how many there are, from slot 0 on.
+        count: mi.UInt32, number of hits, from slot 0 on.
     """
 
     t: Any
@@ -34,7 +34,7 @@ class LocalHits:
 
     @staticmethod
     def none() -> LocalHits:
-        """Capacity for ``MAX_HITS`` of them, and none."""
+        """An empty list with room for ``MAX_HITS`` hits."""
         # The last slot takes the writes of rejected candidates: a masked write in a nested loop crashed LLVM.
         return LocalHits(
             dr.alloc_local(mi.Float, MAX_HITS + 1, value=mi.Float(0)),
@@ -50,10 +50,10 @@ class Walk:
 
     Attributes:
         cursor, end: mi.UInt32, the next candidate and the end of the list.
-        near: mi.Float, what is still to come lies no nearer than this.
-        product: mi.Float, transmittance of all that was hit. farthest: t of the farthest of it.
-        t_cut: mi.Float, nothing beyond it can matter.
-        open: mi.Bool, there may be more to meet.
+        near: mi.Float, lower bound of t of all candidates to come.
+        product: mi.Float, transmittance of all hits so far. farthest: largest t of these hits.
+        t_cut: mi.Float, distance beyond which nothing can matter.
+        open: mi.Bool, the ray may meet more candidates.
     """
 
     cursor: mi.UInt32
@@ -66,9 +66,9 @@ class Walk:
 
     @staticmethod
     def along(start: mi.UInt32, count: mi.UInt32, limit: mi.Float | None = None) -> Walk:
-        """At the beginning of the lists of ``count`` candidates from ``start`` on.
+        """Begin at the lists of ``count`` candidates from ``start`` on.
 
-        ``limit``: distance of each ray beyond which no surfel counts, world units; None: there is none.
+        ``limit``: distance of each ray beyond which no surfel counts, world units; None: no limit.
         """
         return Walk(
             mi.UInt32(start),
@@ -103,10 +103,10 @@ def collect(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, origin: mi.Point3f, direction: mi.Vector3f,
     stop: float, walk: Walk, hits: LocalHits,
 ) -> tuple[Walk, LocalHits]:  # fmt: skip
-    """Walk on through each lane's candidates, adding its front-facing hits, until there is no room for more.
+    """Continue through each lane's candidates and add its front-facing hits, until its slots are full.
 
-    Exact early end: once the product of (1 - alpha) over what was hit falls below ``stop``, nothing beyond
-    the farthest hit so far can matter, because those hits alone already stop the ray.  Lists are sorted
+    Exact early end: once the product of (1 - alpha) over the hits falls below ``stop``, nothing beyond the
+    farthest hit so far can matter, because those hits alone already stop the ray. Lists are sorted
     by ``near``, so traversal ends at the first candidate that begins beyond that distance.
 
     Args:
@@ -114,7 +114,7 @@ def collect(
         entries, near: tile lists' ids, and their lower bounds of t.
         origin, direction: world rays, unit directions.
         stop: transmittance at which compositing ends.
-        walk: where each lane stands. hits: what it has kept.
+        walk: each lane's progress. hits: the hits it holds.
     """
     active = walk.open & (hits.count < MAX_HITS)
     while active:
@@ -141,13 +141,13 @@ def collect(
 def settle(
     walk: Walk, hits: LocalHits, transmittance: mi.Float, stop: float
 ) -> tuple[Walk, LocalHits, mi.UInt32]:
-    """Number of the sorted ``hits`` that are final: no candidate to come can lie before them.
+    """Number of the sorted ``hits`` that are final: no later candidate can lie before them.
 
-    Those behind the one at which the ray stops are dropped; where that is known there may be nothing left to
-    walk to, and all that remain are final.
+    Hits behind the one that stops the ray are dropped. If the ray is known to stop, the walk may end and all
+    remaining hits are final.
 
     Args:
-        transmittance: in front of the first of them.
+        transmittance: in front of the first hit.
     """
     slot, final = mi.UInt32(0), mi.UInt32(0)
     t, product = mi.Float(0), mi.Float(transmittance)
@@ -168,7 +168,7 @@ def settle(
 
 @dr.syntax
 def drop(hits: LocalHits, first: mi.UInt32, active: mi.Bool) -> LocalHits:
-    """Forget the ``first`` hits; the others move up."""
+    """Remove the ``first`` hits and move the others up."""
     slot = mi.UInt32(first)
     moving = active & (slot < hits.count) & (first > 0)
     while moving:
@@ -185,7 +185,7 @@ def drop(hits: LocalHits, first: mi.UInt32, active: mi.Bool) -> LocalHits:
 def sort(hits: LocalHits) -> LocalHits:
     """Order each lane's hits by (t, id) in place, by a sorting network in registers.
 
-    Most packets use less than half the slots, and half the slots are a third of the network.
+    Most packets use less than half the slots, whose network has a third of the comparators.
     """
     t, index, alpha = hits.t, hits.index, hits.alpha
     if hits.count > MAX_HITS // 2:
@@ -196,7 +196,7 @@ def sort(hits: LocalHits) -> LocalHits:
 
 
 def _sorted(count: mi.UInt32, t: Any, index: Any, alpha: Any, size: int) -> tuple[Any, Any, Any]:
-    """The first ``size`` slots in order; slots beyond ``count`` hold nothing and end up last."""
+    """Sort the first ``size`` slots; empty slots, beyond ``count``, come last."""
     ts, ids, alphas = [], [], []
     for slot in range(size):
         ts.append(dr.select(count > slot, t[mi.UInt32(slot)], dr.inf))

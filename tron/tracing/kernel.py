@@ -1,4 +1,4 @@
-"""The kernel of a 2D Gaussian surfel: where a ray meets its disk and how opaque it is there.
+"""The kernel of a 2D Gaussian surfel: where a ray meets its disk, and the opacity there.
 
 A surfel is a flat Gaussian in the plane of its tangents ``t_u, t_v``. With ``p`` the point where the ray
 meets that plane, ``u = (p - c) . t_u / s_u``, ``v = (p - c) . t_v / s_v`` and ``q = u^2 + v^2``, its
@@ -36,11 +36,11 @@ GEOMETRY_PACKETS = 3
 RADIUS = 7
 """Place of the radius in a geometry record."""
 CUT = 11
-"""Place of q_cut, the squared Mahalanobis distance at which a surfel is cut: negative, it counts nowhere."""
+"""Place of q_cut, the squared Mahalanobis distance at which a surfel is cut; negative: it counts nowhere."""
 FEATURE_PACKETS = 3
 """A feature record is 12 floats: normal, roughness | base color, metallic | radiance of SH degree 0, 0."""
 SH_PACKETS = 12
-"""An SH record is 48 floats as scenes store them: (red, green, blue) of one coefficient after the other."""
+"""An SH record is 48 floats in the order of scenes: (red, green, blue) of each coefficient in turn."""
 Function = TypeVar("Function", bound=Callable)
 
 
@@ -55,7 +55,7 @@ def cut_radius_squared(opacity: mi.Float, degree: int, least: float = MIN_RESPON
     Args:
         opacity: after the sigmoid; not differentiated through, because visibility is not.
         degree: kernel degree, 2 or 4.
-        least: response below which nothing counts, whatever the opacity.
+        least: response below which nothing counts, at any opacity.
     """
     if degree not in (2, 4):
         raise TronError(f"kernel degree {degree} is not known", mend="use 2 or 4")
@@ -67,13 +67,13 @@ def cut_radius_squared(opacity: mi.Float, degree: int, least: float = MIN_RESPON
 
 
 def half_axes(u_axis: mi.Vector3f, v_axis: mi.Vector3f, q_cut: mi.Float) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Half axes, conjugate, of the ellipse within which a surfel counts, from the axes of its record.
+    """Conjugate half axes of the ellipse within which a surfel counts, from the axes of its record.
 
-    Those of a record are ``t_u / s_u`` and ``t_v / s_v``, and so at right angles, but for projected splats.
+    The record's axes are ``t_u / s_u`` and ``t_v / s_v``, at right angles except for projected splats.
     """
     reach = dr.sqrt(dr.select(q_cut > 0, q_cut, 0))
     u_scale, v_scale = dr.rcp(dr.norm(u_axis)), dr.rcp(dr.norm(v_axis))
-    u, v = u_axis * u_scale, v_axis * v_scale  # their product may be beyond float32, that of units is not
+    u, v = u_axis * u_scale, v_axis * v_scale  # their product may overflow float32, unit vectors' does not
     normal = dr.cross(u, v)
     reach /= dr.squared_norm(normal)
     return dr.cross(v, normal) * (reach * u_scale), dr.cross(normal, u) * (reach * v_scale)
@@ -91,7 +91,7 @@ def log_response_slope(q: Any, degree: int) -> Any:
 
 @dataclass
 class SurfelRecords:
-    """Surfels as packed Dr.Jit buffers, in the scene's order (made by :func:`tron.tracing.parameters.pack`).
+    """Surfels as packed Dr.Jit buffers, in the scene's order, from :func:`tron.tracing.parameters.pack`.
 
     Attributes:
         geometry: mi.Float, M records of ``4 * GEOMETRY_PACKETS``.
@@ -100,9 +100,9 @@ class SurfelRecords:
         count: M; 1 where the scene has no surfel: a record that no ray meets.
         degree: kernel degree, 2 or 4.
         sh_degree: highest SH degree that is evaluated.
-        values: mi.Float, M records of more quantities to composite, up to a whole packet, or None.
-        value_count: how many they are.
-        pixel: low-pass filter of the one camera that they are for (:func:`intersect`); None: they have none.
+        values: mi.Float, M records of further quantities to composite, padded to whole packets, or None.
+        value_count: number of these quantities.
+        pixel: low-pass filter of the camera that the records are for (:func:`intersect`); None: no filter.
     """
 
     geometry: mi.Float
@@ -116,7 +116,7 @@ class SurfelRecords:
     pixel: mi.Vector3f | None = None
 
     def detached(self) -> SurfelRecords:
-        """The same buffers, cut off from automatic differentiation."""
+        """The same buffers, detached from automatic differentiation."""
         return replace(
             self,
             geometry=dr.detach(self.geometry),
@@ -126,7 +126,7 @@ class SurfelRecords:
         )
 
     def turned_over(self, which: mi.Bool) -> SurfelRecords:
-        """The same disks, those of ``which``, M lanes, with their sides exchanged."""
+        """The same disks; those selected by ``which``, M lanes, with front and back exchanged."""
         return replace(
             self,
             geometry=turned_geometry(self.geometry, which),
@@ -135,12 +135,12 @@ class SurfelRecords:
 
 
 def turned_geometry(geometry: mi.Float, which: mi.Bool) -> mi.Float:
-    """Geometry records of the same disks, some with their sides exchanged: t_v is negated."""
+    """Geometry records of the same disks, some with front and back exchanged by negating t_v."""
     return _negated(geometry, GEOMETRY_PACKETS, 2, which)
 
 
 def _negated(records: mi.Float, packets: int, packet: int, which: mi.Bool) -> mi.Float:
-    """Records of so many packets; the first three floats of one packet change their sign in ``which``."""
+    """Negate the first three floats of one packet in the records of ``which``."""
     index = dr.arange(mi.UInt32, dr.width(records))
     place, record = index % (4 * packets), index // (4 * packets)
     turned = dr.gather(mi.Bool, which, record, record < dr.opaque(mi.UInt32, dr.width(which)))
@@ -152,18 +152,18 @@ def _negated(records: mi.Float, packets: int, packet: int, which: mi.Bool) -> mi
 
 @dataclass
 class SurfelHit:
-    """One ray against one surfel. All fields are Dr.Jit variables; those that nobody reads are not computed.
+    """One ray against one surfel. All fields are Dr.Jit variables; unread ones are not computed.
 
     Attributes:
         t: distance along the unit ray to the surfel's plane, world units.
         alpha: opacity at the hit, clipped to 0.99.
         within: the hit lies where the kernel counts (alpha >= 1/255, response >= 0.0113).
         front: the ray meets the side that the normal points to.
-        radius: of the disk within which the surfel counts, along its longer axis, world units.
+        radius: longer radius of the disk within which the surfel counts, world units.
         unclipped: opacity before clipping. response: the kernel's value.
         u_axis, v_axis: t_u / s_u and t_v / s_v. normal: their cross product. facing: normal . direction.
-        offset: p - c. u, v: its coordinates in standard deviations. q: its squared distance in them.
-        filtered: where there is a pixel's filter, and it is what the ray meets; else None.
+        offset: p - c. u, v: its coordinates in standard deviations. q: u^2 + v^2.
+        filtered: the hit of the pixel's filter; None if the records have no filter.
     """
 
     t: mi.Float
@@ -206,9 +206,9 @@ def intersect(
 ) -> SurfelHit:  # fmt: skip
     """Meet a ray with the surfel ``index`` (formula: module docstring).
 
-    ``pixel`` is the camera's forward axis times a filter's deviation over the focal length. Where it is given
-    counts the larger of the disk and that Gaussian about the projected centre (Huang et al. 2024, equation
-    11), from both sides and at the depth of the centre.
+    ``pixel`` is the camera's forward axis times the filter's deviation over the focal length. If it is given,
+    the larger of the disk's response and that of the filter's Gaussian about the projected centre counts
+    (Huang et al. 2024, equation 11); the filter is met from both sides, at the depth of the centre.
 
     The normal is not stored: ``(t_u / s_u) x (t_v / s_v)`` points the same way and its length cancels in t.
     Reading memory dominates, so a record is three packets and everything else is recomputed.
@@ -232,7 +232,7 @@ def intersect(
         aside = slope * direction - to_centre / depth
         spread = dr.squared_norm(aside)
         filtered = Filtered(depth, slope, aside, ~((q <= spread) & (t > 0)))
-        # What is met of a disk that is seen from exactly edge on is no number, nor are its derivatives.
+        # The hit of a disk seen exactly edge on is NaN, and so are its derivatives.
         q = dr.select(filtered.larger, spread, q)
         u, v, offset = (dr.select(filtered.larger, 0, each) for each in (u, v, offset))
         facing = dr.select(filtered.larger, -1, facing)
@@ -261,14 +261,13 @@ def intersect(
 
 
 def recorded(function: Function) -> Function:
-    """Freeze ``function``, which is recorded once for each kind of arguments; ``__wrapped__`` is Dr.Jit's.
+    """Freeze ``function``: record it once for each kind of arguments; ``__wrapped__`` is Dr.Jit's function.
 
-    Nothing is collected in between: a Mitsuba object that is freed while Dr.Jit records a function aborts the
-    process, and Python's collector of cycles may free one at any allocation: an integrator or a scene that
-    nobody holds any more.
+    Garbage collection is off while recording: freeing a Mitsuba object then aborts the process, and Python's
+    collector may free an unused integrator or scene at any allocation.
 
-    Of Python's own numbers Dr.Jit 1.5.0 knows only the first of a value: a second one equal to an earlier is
-    taken for any other such (4, 3, 4 for 4, 3, 3). So they are told apart here.
+    Among Python numbers in the arguments, Dr.Jit 1.5.0 does not tell repeated values apart (it takes 4, 3, 4
+    for 4, 3, 3). So the numbers are part of the key here.
     """
     frozen = dr.freeze(function, state_fn=lambda *arguments: _kind(arguments), limit=64, warn_after=1000)
 
@@ -286,7 +285,7 @@ def recorded(function: Function) -> Function:
 
 
 def _kind(value: object) -> str:
-    """What is no array in arguments, in order."""
+    """All arguments that are not arrays, in order."""
     if is_dataclass(value):
         return _kind([getattr(value, field.name) for field in fields(value)])
     if isinstance(value, (list, tuple)):

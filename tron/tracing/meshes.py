@@ -1,17 +1,17 @@
-"""Meshes beside surfels: one more occluder, and one opaque layer that lies behind what surfels are in front.
+"""Meshes beside surfels: one more occluder, and an opaque layer behind the surfels in front of it.
 
-Camera rays meet the mesh first (Embree, OptiX). Where they do, surfels count up to there and no farther, and
-what is left of the ray, T, ends at the mesh, as at one more surfel of opacity 1:
+Camera rays are traced against the mesh first (Embree, OptiX). Where they meet it, surfels count up to that
+distance, and the remaining transmittance T ends at the mesh, as at one more surfel of opacity 1:
 
     opacity    1                        where a mesh is met
-    materials  (1 - T) surfels + T mesh     likewise normals and values
+    materials  (1 - T) surfels + T mesh     the same for normals and values
     position   of the surfels where T < 0.5, else of the mesh
 
 Rays that leave a mesh leave it along its triangles' normal, not along the shading normal, which may look
 below the triangle (the terminator problem).
 
-Light bounces among surfels. So a mesh has surfels of its own, spread evenly over it, that stand for it there;
-no camera and no shadow ray meets them.
+Light bounces among surfels only. So a mesh gets stand-in surfels, spread evenly over it, which take part in
+bounces; no camera ray and no shadow ray meets them.
 """
 
 from __future__ import annotations
@@ -41,9 +41,9 @@ if TYPE_CHECKING:
     from tron.models.parts import Part
 
 STAND_INS = 20_000
-"""Surfels that stand for all meshes where light bounces."""
+"""Number of stand-in surfels of all meshes together, for bounced light."""
 _REACH = 3.0
-"""Spacings behind the mesh up to which its own surfels count for a pixel."""
+"""Spacings behind the mesh up to which its stand-ins count for a pixel."""
 _COVERED = 0.5
 Pose = tuple[np.ndarray, np.ndarray, np.ndarray]
 """A rotation (3, 3), the point (3,) that it keeps, and the shift (3,) after it, world."""
@@ -54,8 +54,8 @@ class MeshView(GBuffer):
     """A view with a mesh in it.
 
     Attributes:
-        leaving: what rays leave a pixel along, world: the normal, or that of a mesh's triangle times its
-            clearance over that of surfels.
+        leaving: offset direction of rays that leave a pixel, world: the normal; on a mesh the triangle's
+            normal, scaled by the mesh's clearance over the surfels'.
     """
 
     leaving: mi.Vector3f
@@ -67,12 +67,12 @@ class MeshView(GBuffer):
 
 @dataclass(frozen=True, eq=False)
 class _Model:
-    """One model where it stands.
+    """One model at its place.
 
     Attributes:
-        parts: its triangles, world. shapes: the same as Mitsuba has them.
-        stand_ins: surfels on them.
-        nearest: (F,) uint32 the one nearest to the middle of each triangle, part after part.
+        parts: its triangles, world. shapes: the same triangles as Mitsuba shapes.
+        stand_ins: surfels on the triangles.
+        nearest: (F,) uint32 the stand-in nearest to the middle of each triangle, part after part.
     """
 
     parts: tuple[Part, ...]
@@ -82,7 +82,7 @@ class _Model:
 
     @classmethod
     def of(cls, parts: Sequence[Part], name: str, surfels: int, seed: int) -> _Model:
-        from tron.models.sides import spacing_of, two_sided  # trimesh: for meshes alone
+        from tron.models.sides import spacing_of, two_sided  # trimesh: needed for meshes only
         from tron.models.surfels import surfels_of_model
 
         if not sum(len(part.faces) for part in parts):
@@ -113,11 +113,11 @@ class Meshes:
     """Opaque models in the world of a scene.
 
     Args:
-        models: parts of each (:func:`tron.models.load.load_model`), where they stand, in world units.
-        seed: root of the random numbers of places of surfels.
+        models: the parts of each (:func:`tron.models.load.load_model`), placed in the world, world units.
+        seed: root of the random numbers that place the stand-ins.
 
     Attributes:
-        stand_ins: surfels on the models' surface, for light that bounces.
+        stand_ins: surfels on the models' surface, for bounced light.
 
     Raises:
         TronError: a model has no triangles.
@@ -141,7 +141,7 @@ class Meshes:
         self._tracer = SurfelTracer(self.stand_ins)
 
     def moved(self, poses: Sequence[Pose | None]) -> Meshes:
-        """The models elsewhere: a pose for each, from where it stands; None: there."""
+        """The models at new places: for each a pose relative to its present place; None: unmoved."""
         other = copy(self)
         other._stand(
             [model if pose is None else model.moved(pose) for model, pose in zip(self._models, poses)]
@@ -149,15 +149,15 @@ class Meshes:
         return other
 
     def blocked(self, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool) -> mi.Bool:
-        """Whether a mesh stands in the way of rays from ``origin`` along unit ``direction``."""
+        """Whether a mesh blocks rays from ``origin`` along unit ``direction``."""
         return self._scene.ray_test(mi.Ray3f(origin, direction), active)
 
     def seen(self, camera: Camera, spacing: float) -> MeshLayer:
-        """What a camera sees of the meshes.
+        """Trace the meshes for a camera.
 
         Args:
             camera: the view.
-            spacing: of the scene's surfels, world units, by which rays leave surfaces.
+            spacing: of the scene's surfels, world units; it sets the offset of rays that leave surfaces.
         """
         rays = tile_rays(camera)
         si, shading = surface_points(
@@ -189,10 +189,10 @@ class Meshes:
         return layer
 
     def values_at(self, camera: Camera, layer: MeshLayer, values: Sequence[mi.Float]) -> list[mi.Float]:
-        """Numbers of the surfels that stand for the meshes, at what a camera sees of them.
+        """Values of the stand-ins at the meshes' pixels.
 
-        Composited, as those of a scene's surfels are; where they leave a hole, of the one that is nearest to
-        the triangle.
+        They are composited like those of a scene's surfels; in a hole between stand-ins, the value of the one
+        nearest to the triangle.
         """
         if not values:
             return []
@@ -210,15 +210,15 @@ class Meshes:
 
 @dataclass
 class MeshLayer:
-    """What camera rays meet of meshes, in tile order; 0 where they meet none.
+    """The mesh surface that each camera ray meets, in tile order; 0 where it meets none.
 
     Attributes:
-        met: mi.Bool, whether they do.
+        met: mi.Bool, whether the ray meets a mesh.
         depth: along the unit ray, world units. position: world.
-        normal: unit shading normal that the ray sees. leaving: as of :class:`MeshView`.
+        normal: unit shading normal that faces the ray. leaving: as in :class:`MeshView`.
         base_color, roughness, metallic: of the material there, linear.
-        face: mi.UInt32, number of the triangle among those of all parts.
-        emission: linear radiance that it emits towards the ray; None where no mesh glows.
+        face: mi.UInt32, number of the triangle, counted over all parts.
+        emission: linear radiance emitted towards the ray; None if no mesh glows.
     """
 
     met: mi.Bool
@@ -240,9 +240,9 @@ class MeshLayer:
         return limit
 
     def behind(self, surfels: GBuffer, values: Sequence[mi.Float]) -> MeshView:
-        """The view of surfels, which were traced up to :attr:`limit`, with the meshes behind them.
+        """Composite surfels, traced up to :attr:`limit`, over the meshes behind them.
 
-        ``values``: what the meshes have of the surfels' ``values``.
+        ``values``: the meshes' counterpart of the surfels' ``values``.
         """
         share = dr.select(self.met, 1 - surfels.opacity, 0)
 
@@ -281,12 +281,12 @@ class MeshLayer:
 
 
 def _scene_of(shapes: Sequence[Shape]) -> mi.Scene:
-    """A Mitsuba scene without light, which answers rays."""
+    """A Mitsuba scene without light, for ray intersection."""
     return mi.load_dict({"type": "scene"} | {f"mesh{i}": each.shape for i, each in enumerate(shapes)})
 
 
 def _onto(shapes: Sequence[Shape], surfels: GaussianScene) -> np.ndarray:
-    """(M, 3) float32 centres on the triangles: a mean of points on a bent surface lies beneath it."""
+    """Project centres (M, 3) onto the triangles: a mean of points on a bent surface lies beneath it."""
     reach, normals = 2 * surfels.spacing, surfels.normals()
     start, along = surfels.means + 0.5 * reach * normals, lanes(mi.Vector3f, -normals)
     ray = mi.Ray3f(lanes(mi.Point3f, start), along)

@@ -28,7 +28,7 @@ if TYPE_CHECKING:
 
 @dataclass
 class SurfelParameters:
-    """M surfels as flat Dr.Jit arrays, each the row-major array of :class:`GaussianScene` laid out flat.
+    """M surfels as flat Dr.Jit arrays: the arrays of :class:`GaussianScene`, flattened row by row.
 
     Attributes:
         means: mi.Float (3M), world.
@@ -57,10 +57,10 @@ class SurfelParameters:
 
     @staticmethod
     def from_scene(scene: GaussianScene, sh_degree: int | None = None) -> SurfelParameters:
-        """Upload a scene (of zero surfels, too).
+        """Upload a scene, which may have no surfels.
 
-        ``sh_degree`` is the highest with a coefficient that is not zero, unless given: harmonics that are to
-        be learnt begin at zero, and those beyond the degree get no gradient.
+        ``sh_degree`` defaults to the highest degree with a nonzero coefficient. Give it to learn harmonics
+        that begin at zero: coefficients beyond the degree get no gradient.
         """
         degree = highest_sh_degree(scene) if sh_degree is None else sh_degree
         arrays = {name: mi.Float(aligned(getattr(scene, name).ravel())) for name in PARAMETERS}
@@ -69,7 +69,7 @@ class SurfelParameters:
         )
 
     def differentiable(self) -> bool:
-        """Whether any of them has gradients enabled."""
+        """Whether any parameter has gradients enabled."""
         return dr.grad_enabled(*[getattr(self, name) for name in PARAMETERS])
 
 
@@ -123,7 +123,7 @@ def pack_values(records: SurfelRecords, values: Sequence[mi.Float]) -> SurfelRec
 
     Args:
         records: M surfels.
-        values: each mi.Float of M numbers in the scene's order, or of one for all; none: none.
+        values: each mi.Float of M numbers in the scene's order, or one number for all; may be empty.
 
     Raises:
         TronError: an array of another length.
@@ -156,10 +156,10 @@ def _constant_radiance(sh: mi.Float, surfel: mi.UInt32) -> list[mi.Float]:
 
 
 def _column(values: mi.Float, index: mi.UInt32) -> mi.Float:
-    # Each number is read once, yet the adjoint must not be told so, nor any other mode: Dr.Jit 1.5 then
-    # overwrites (Permute, Direct, Local, and NoConflicts in part) what other uses of the parameters have
-    # added, such as a regulariser of the loss. Left to itself it makes copies for each thread; their kernel
-    # is compiled for each number of surfels.
+    # Each number is read once, yet the gather must not declare that, nor any other mode: Dr.Jit 1.5 then
+    # overwrites (Permute, Direct, Local, and NoConflicts in part) the gradients that other uses of the
+    # parameters have added, such as a regulariser of the loss. By default it makes copies for each thread;
+    # their kernel is compiled for each number of surfels.
     return dr.gather(mi.Float, values, index)
 
 

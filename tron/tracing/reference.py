@@ -1,4 +1,4 @@
-"""Slow float64 NumPy versions of the tracer: the oracle of every test, sharing no code with what it judges.
+"""Slow float64 NumPy reference of the tracer: the oracle of every test, sharing no code with the tracer.
 
 Only constants are shared; intersection, ordering, stopping and compositing are written again here in the most
 obvious way.
@@ -24,7 +24,7 @@ from tron.tracing.surface import EVEN, FACES
 
 
 class Scene(Protocol):
-    """Attributes that are read of a ``GaussianScene``; finite differences bring one of float64 arrays."""
+    """The attributes read from a ``GaussianScene``; tests by finite differences pass float64 arrays."""
 
     means: np.ndarray
     quats: np.ndarray
@@ -44,18 +44,18 @@ class ReferenceHits:
 
     Attributes:
         normal, base_color, rgb: (P, 3).
-        face: (P, 3), the part of ``normal`` that belongs to the face that is met, where two are; else all.
+        face: (P, 3), the part of ``normal`` from the face that is met, if the ray sees two; else all of it.
         roughness, metallic, mean_depth: (P,).
         transmittance: (P,) after the last counted hit.
         median_depth: (P,) distance of the first hit after which T < 0.5, or 0.
-        lift: (P,) distance from the first hit after which T < 0.9 to that one, or 0.
+        lift: (P,) distance from the first hit after which T < 0.9 to the median hit, or 0.
         hits: (P,) int, number of composited hits.
-        margin: (P,) smallest distance of any value that the ray compares before it stops to its threshold
-            (T_MIN, alpha cut, stop, median, lift, faces): pixels with a tiny one may differ in float32.
-        gap: (P,) smallest distance along the ray between two composited hits that are neighbours; where it is
-            tiny, rounding may order them otherwise.
+        margin: (P,) smallest difference between a value and the threshold it is compared with before the ray
+            stops (T_MIN, alpha cut, stop, median, lift, faces); if it is tiny, float32 may decide otherwise.
+        gap: (P,) smallest distance along the ray between two consecutive composited hits; if it is tiny,
+            rounding may swap them.
         candidates: (P,) int, surfels whose kernel counts where the ray hits them, on either side.
-        front: (P,) int, those of them that it hits from the front.
+        front: (P,) int, candidates that the ray hits from the front.
     """
 
     normal: np.ndarray
@@ -92,10 +92,10 @@ class _Meetings:
 
     Attributes:
         t: distance to the surfel's plane. alpha: opacity there, clipped.
-        radius: (M,), of the disk within which the kernel counts, along its longer axis.
-        counted: the kernel counts there, on whichever side. front: the ray meets the front.
+        radius: (M,) longer radius of the disk within which the kernel counts.
+        counted: the kernel counts there, on either side. front: the ray meets the front.
         normal: (M, 3). aside: distance of the ray's origin from the surfel's plane.
-        margin: distance of response and opacity to their cuts.
+        margin: distance of response and opacity from their cuts.
     """
 
     t: np.ndarray
@@ -132,7 +132,7 @@ def _meet(scene: Scene, origins: np.ndarray, directions: np.ndarray) -> _Meeting
         front=facing < 0,
         normal=rotations[:, :, 2],
         aside=np.abs(np.nan_to_num(t) * facing),
-        # A surfel is cut by whichever threshold it falls below first; the other one decides nothing.
+        # A surfel is cut by the threshold that it falls below first; the other has no effect.
         margin=np.abs(np.minimum(response - MIN_RESPONSE, raw - MIN_ALPHA)),
     )
 
@@ -152,7 +152,7 @@ def composite(
     Args:
         scene: the surfels.
         origins, directions: (P, 3), world; directions of unit length.
-        sh_directions: (P, 3), where radiance is evaluated instead of along the rays.
+        sh_directions: (P, 3), to evaluate radiance in these directions instead of the rays'.
     """
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     views = directions if sh_directions is None else np.asarray(sh_directions, np.float64)
@@ -203,7 +203,7 @@ def _composite_block(
         hits[ray] += 1
     met = [_face(scene, normals, hit.radius, *each) for each in zip(lists, origins, directions, strict=True)]
     margin = np.minimum(margin, [close for _, close in met])
-    # What lies behind the hit that stopped a ray is never compared with anything.
+    # Hits behind the one that stopped a ray are not compared with anything.
     reached = np.where(remaining < STOP_TRANSMITTANCE, last, np.inf)
     compared = hit.front & (hit.t > 0) & (hit.t <= reached[:, None] + 1e-5)
     cuts = np.where(compared, hit.margin, np.inf).min(1, initial=np.inf)
@@ -231,7 +231,7 @@ def _face(
     scene: Scene, normals: np.ndarray, radii: np.ndarray, hits: list[tuple[int, float]], origin: np.ndarray,
     direction: np.ndarray,
 ) -> tuple[np.ndarray, float]:  # fmt: skip
-    """Sum of ``w n`` of the face that a ray meets, and its margin to where that would be another."""
+    """Sum of ``w n`` over the face that a ray meets, and the margin by which that face was chosen."""
     groups: tuple[list[int], list[int]] = ([], [])
     total, weights, margin = np.zeros((2, 3)), np.zeros(2), np.inf
     for surfel, weight in hits:
@@ -270,10 +270,10 @@ def transmittance(
 ) -> tuple[np.ndarray, np.ndarray]:
     """Transmittance of shadow rays and its margin to a threshold, both (P,) float64.
 
-    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings (never, if one-sided),
-    which are the scene's, and larger by as much as the surfel's radius is larger than the median. Nearer than
-    two of a surfel's own spacings, smaller where it is, fronts that face against ``normals`` (P, 3) of the
-    surface that rays leave do not count within ``SHEET_SPACINGS`` of their plane (if two-sided).
+    Front faces count from t = 0, back faces beyond ``BACK_FACE_SPACINGS`` spacings of the scene, scaled up
+    for surfels of more than the median radius (never, if one-sided). If two-sided, a front face is ignored
+    when it faces against ``normals`` (P, 3) of the surface that the ray leaves, is nearer than two spacings,
+    and its plane lies within ``SHEET_SPACINGS`` of the origin; these spacings are the surfel's own.
     """
     hit, blocks, nearby = _blocking(scene, origins, directions, two_sided, normals)
     product = np.where(blocks, 1 - hit.alpha, 1.0).prod(1)
@@ -284,7 +284,7 @@ def transmittance(
 def first_hit_probabilities(
     scene: Scene, origins: np.ndarray, directions: np.ndarray, *, two_sided: bool = True
 ) -> np.ndarray:
-    """(P, M) float64 weights T_i alpha_i of each surfel along each ray, sides as of :func:`transmittance`."""
+    """(P, M) float64 weights T_i alpha_i of each surfel along each ray, sided as in :func:`transmittance`."""
     hit, blocks, _ = _blocking(scene, origins, directions, two_sided)
     order = np.argsort(np.where(blocks, hit.t, np.inf), axis=1, kind="stable")
     alpha = np.take_along_axis(np.where(blocks, hit.alpha, 0.0), order, 1)
@@ -301,7 +301,7 @@ def _blocking(
     two_sided: bool,
     normals: np.ndarray | None = None,
 ) -> tuple[_Meetings, np.ndarray, np.ndarray]:
-    """Meetings of shadow rays, which of them block (P, M), and each ray's margin to where another would."""
+    """Intersections of shadow rays, whether each blocks (P, M), and each ray's margin in that decision."""
     origins, directions = np.asarray(origins, np.float64), np.asarray(directions, np.float64)
     hit = _meet(scene, origins, directions)
     radii = hit.radius[hit.radius > 0]

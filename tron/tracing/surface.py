@@ -1,13 +1,13 @@
 """Sums over hits -> surface points: the normalisation that every ray of the library goes through.
 
 Composited channels are alpha-weighted sums, so materials are divided by opacity and the normal is brought
-back to unit length (conventions.md, 7). The surface point is at the median depth; where transmittance
-never falls below one half there is no median, and the alpha-weighted mean depth stands in where opacity is
-not zero. The median is where the ray meets the plane of the surfel's own disk, also where a camera sees its
-projection, which lies at one depth: light falls where the surface is.
+back to unit length (conventions.md, 7). The surface point is at the median depth; if transmittance never
+falls below one half there is no median, and the alpha-weighted mean depth is used where opacity is not zero.
+The median depth is measured to the plane of the surfel's own disk, even if the camera draws its projection,
+which lies at one depth: shading needs the place of the surface.
 
-Where a ray meets two faces of an edge, a mean of their normals mirrors lamps that neither sees. The normal is
-one face's there, and on a ridge so is the point, unless geometry is differentiated: :func:`_of_one_face`.
+If a ray meets both faces of an edge, the mean of their normals reflects lamps that neither face sees. So the
+normal, and on a ridge the point, is one face's, unless geometry is differentiated: :func:`_of_one_face`.
 """
 
 from __future__ import annotations
@@ -21,35 +21,35 @@ from tron.tracing.compositing import CHANNELS, NO_SURFEL, Composite
 from tron.tracing.kernel import FEATURE_PACKETS, GEOMETRY_PACKETS, SurfelRecords, half_axes
 
 BEYOND = 2.0
-"""Times its own reach that a disk's plane is followed: a projection is wider by its pixel's filter."""
+"""A disk's plane is followed up to this many times its reach: the pixel's filter widens a projection."""
 EVEN, FACES = 0.98, 0.6
-"""Two faces are seen where normals of either are of one mind, as their mean's length tells, and the cosine
-between them is less: not on a wire four pixels thick, nor in a scan's fog."""
+"""A ray sees two faces if each face's mean normal has at least the first length and the cosine between them
+is below the second: not on a wire four pixels thick, nor in a scan's fog."""
 GRAZING = 0.05
-"""Cosine to the ray of normals that looked away and are bent."""
+"""Cosine to the ray that normals facing away are bent to."""
 
 
 @dataclass
 class Surface:
-    """Surface that each ray sees, as Dr.Jit arrays of one lane a ray.
+    """Surface that each ray sees, as Dr.Jit arrays of one lane per ray.
 
     Attributes:
         position: mi.Point3f, world; meaningless where opacity is 0.
         depth: mi.Float, distance along the unit ray to the median hit, world units; 0 where there is none.
             Not differentiated.
-        lift: mi.Float, distance to it from the first hit after which less than 0.9 of the light is left: how
-            thick what stands for a surface is, world units; 0 where there is none. Not differentiated.
-        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0. Where faces meet it is that of
-            one; where geometry is differentiated it is the mean.
-        normal_sum: mi.Normal3f, sum of ``w n`` before it is brought to unit length: shorter than the opacity
-            where the surfels of a ray face several ways.
+        lift: mi.Float, distance from the first hit after which T < 0.9 to the median hit, a measure of the
+            surface's thickness, world units; 0 without a median. Not differentiated.
+        normal: mi.Normal3f, unit, world, geometric; zero where opacity is 0. At an edge it is one face's
+            normal, or the mean if geometry is differentiated.
+        normal_sum: mi.Normal3f, sum of ``w n`` before normalisation: shorter than the opacity where the
+            surfels along a ray face different ways.
         base_color: mi.Color3f, linear.
         roughness, metallic: mi.Float.
         rgb: mi.Color3f, composited SH radiance in display space, premultiplied by opacity.
         opacity: mi.Float, 1 - T.
         direction: mi.Vector3f, the unit ray, world.
-        values: list of mi.Float, what else was composited, in the unit of each; none unless asked for.
-        emission: mi.Color3f, linear radiance that it emits towards the ray; None where nothing glows.
+        values: list of mi.Float, further composited quantities, each in its own unit; empty by default.
+        emission: mi.Color3f, linear radiance emitted towards the ray; None if nothing glows.
     """
 
     position: mi.Point3f
@@ -67,7 +67,7 @@ class Surface:
     emission: mi.Color3f | None = field(default=None, kw_only=True)
 
     def raised(self, offset: mi.Float) -> mi.Point3f:
-        """Origins of rays that leave the surface, ``offset`` above it, world units; not differentiated."""
+        """Origins of rays leaving the surface, ``offset`` above it, world units; not differentiated."""
         return mi.Point3f(dr.detach(self.position)) + mi.Normal3f(dr.detach(self.normal)) * offset
 
 
@@ -83,13 +83,13 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
     channels = sums.channels
     normal_sum = mi.Normal3f(*channels[0:3])
     normal, ridge = normal_sum, mi.UInt32(NO_SURFEL)
-    if not dr.grad_enabled(records.geometry):  # materials are differentiated at what is drawn
+    if not dr.grad_enabled(records.geometry):  # materials are differentiated through the drawn disks
         normal, ridge = _of_one_face(sums, records, origin, direction)
     squared = dr.squared_norm(normal)
     oriented = squared > 0
     depth = depth_along(records, sums.median, origin, direction)
     distance = dr.select(depth > 0, depth, sums.mean_depth * inverse)
-    # Rays that left a surfel's end in the air by the other face's normal would meet its neighbours.
+    # From a surfel's overhanging end, a ray along the other face's normal would hit the surfel's neighbours.
     distance = dr.select(ridge != NO_SURFEL, depth_along(records, ridge, origin, direction), distance)
     return Surface(
         position=origin + distance * direction,
@@ -110,12 +110,12 @@ def surface(sums: Composite, records: SurfelRecords, origin: mi.Point3f, directi
 def _of_one_face(
     sums: Composite, records: SurfelRecords, origin: mi.Point3f, direction: mi.Vector3f
 ) -> tuple[mi.Normal3f, mi.UInt32]:
-    """Sum of ``w n`` over the face that a ray meets, where it meets two; else over all hits. Detached.
+    """Sum of ``w n`` over one face if the ray meets two, else over all hits; detached.
 
-    Of ridges, also the surfel whose plane it meets; ``NO_SURFEL`` elsewhere.
+    On a ridge, also the surfel whose plane the ray meets; ``NO_SURFEL`` elsewhere.
 
-    Of two faces it is the one that hides more. But if each lies behind the other's plane, their edge is a
-    ridge, and surfels reach past it into the air: a ray enters what is convex by the later of the planes.
+    Of two faces, the one with the larger weight is chosen. But if each lies behind the other's plane, their
+    edge is a ridge and surfels reach past it into the air: a ray enters a convex solid at the later plane.
     """
     every, front = mi.Normal3f(*sums.channels[0:3]), mi.Normal3f(*sums.front[0:3])
     weight, rest = sums.front[3], every - front
@@ -130,7 +130,7 @@ def _of_one_face(
         radii.append(axis.w)
     apart = places[1] - places[0]
     met = dr.dot(front, places[0] - origin) / dr.dot(front, direction) * direction - (places[1] - origin)
-    # Of the first face over the plane of the other, where the ray meets it.
+    # Height of the first face above the other's plane, where the ray meets it.
     height = dr.dot(rest, met) / short
     ridge = (dr.dot(front, apart) < 0) & (dr.dot(rest, apart) > 0) & (dr.abs(height) < dr.maximum(*radii))
     first = dr.select(ridge, height < 0, weight >= others)
@@ -141,10 +141,10 @@ def _of_one_face(
 def depth_along(
     records: SurfelRecords, surfel: mi.UInt32, origin: mi.Point3f, direction: mi.Vector3f
 ) -> mi.Float:
-    """Distance along unit rays to the planes of some surfels' disks, detached; 0 where there is no surfel.
+    """Distance along unit rays to the planes of surfels' disks, detached; 0 without a surfel.
 
-    No farther from a centre than twice what the disk reaches along the ray: where it is seen edge on, its
-    plane is met anywhere, or nowhere.
+    It is clamped to twice the disk's reach along the ray about its centre, because a plane seen edge on may
+    be met anywhere or nowhere.
     """
     some = surfel != NO_SURFEL
     geometry, base = dr.detach(records.geometry), surfel * GEOMETRY_PACKETS
@@ -156,13 +156,13 @@ def depth_along(
     middle, reach = dr.dot(to_centre, along), BEYOND * dr.sqrt(u * u + v * v)
     normal = dr.cross(u_axis, v_axis)
     beyond = dr.dot(normal, to_centre) / dr.dot(normal, along) - middle
-    # Of a disk that is seen from exactly edge on this is no number, and no comparison holds.
+    # For a disk seen exactly edge on this is NaN, and every comparison is false.
     beyond = dr.select(dr.abs(beyond) <= reach, beyond, dr.select(beyond > 0, reach, -reach))
     return dr.select(some, middle + beyond, 0)
 
 
 def seen_normal(normal: mi.Vector3f, direction: mi.Vector3f) -> mi.Vector3f:
-    """Unit normals, bent where they look away from rays along unit ``direction``, until those see them."""
+    """Unit normals; those facing away from rays along unit ``direction`` are bent towards them."""
     away = dr.dot(normal, direction)
     bent = dr.normalize(normal - (away + GRAZING) * direction)
     return dr.select(away > 0, bent, normal)
@@ -171,8 +171,8 @@ def seen_normal(normal: mi.Vector3f, direction: mi.Vector3f) -> mi.Vector3f:
 def centres(records: SurfelRecords, surfel: mi.UInt32, active: mi.Bool | bool = True) -> Surface:
     """Centres, unit normals and materials of ``surfel``, one lane each, differentiable in the records.
 
-    Opacity is 1, also the surfels' own; 0 in inactive lanes. There is no ray, and 0 is what comes of one:
-    depth, lift, direction and rgb.
+    Opacity is 1, whatever the surfel's own; 0 in inactive lanes. As there is no ray, depth, lift, direction
+    and rgb are 0.
     """
     active = mi.Bool(active)
 

@@ -1,13 +1,13 @@
 """Surroundings: splats far around the content that shut out the light, such as a shell of sky around a scan.
 
-Scans taken outdoors paint the sky that they saw onto splats far away. Under another light they are a lid: no
-ray from the content gets past them. What tells them from walls, hills and strays:
+Outdoor scans paint the sky onto splats far away. Under another light these act as a lid that no ray from the
+content can pass. Three properties tell them from walls, hills and strays:
 
-- a gap: they are several times as far from the middle as what lies within, and next to nothing is between.
-  A room's floor leads to its walls.
-- they are few and large: a share of the splats, each larger than the content's. Walls are what was scanned.
-- they are overhead: rays from the content to directions well above the horizon end at them. Hills stay, and
-  so do strays, and whatever lies much nearer than where those rays end.
+- a gap: they are several times as far from the middle as the content, with next to nothing in between. In a
+  room, the floor bridges the gap to the walls.
+- few and large: they are a minor share of the splats, each larger than the content's. Scanned walls are not.
+- overhead: rays from the content to directions well above the horizon end at them. So hills and strays are
+  kept, and so is everything much nearer than the ends of those rays.
 """
 
 from __future__ import annotations
@@ -23,32 +23,32 @@ from tron.seeds import generator
 from tron.tracing.tracer import SurfelTracer
 
 GAP = 3.0
-"""Least ratio of distances from the middle: of the surroundings over that of the content."""
+"""Least ratio of the surroundings' distance from the middle to the content's."""
 CLEAR = 1.5
 """The gap begins at this many times the distance that holds the content."""
 BRIDGED = 0.02
-"""Largest area of splats within the gap, as a share of that of the surroundings: a floor leads to walls."""
+"""Largest area of splats within the gap, as a share of the surroundings' area: a floor leads to walls."""
 COVERED = 0.1
-"""Largest area of them as a share of a level ring from end to end of the gap: a floor covers 0.4."""
+"""Largest area of splats within the gap, as a share of the level ring that spans it: a floor covers 0.4."""
 MOST = 0.6
-"""Largest share of the splats."""
+"""Largest share of all splats that can be surroundings."""
 LARGER = 2.0
-"""Least ratio of their median standard deviation to that of the content."""
+"""Least ratio of their median standard deviation to the content's."""
 OVERHEAD = 0.4
-"""Least share of the directions overhead that they shut."""
+"""Least share of the directions overhead that they block."""
 LOWEST_DEG = 30.0
-"""Elevation from which on a direction is overhead: farther hills are lower."""
+"""Least elevation of a direction overhead; distant hills are lower."""
 NEAREST = 0.6
-"""Distance of what belongs to them, over that at which rays end."""
+"""Least distance of a surrounding splat, over the distance at which rays end."""
 _SOLID = 0.5
 _FEWEST = 12
 _ORIGINS, _DIRECTIONS = 8, 128
 
 
 def find_surroundings(scene: GaussianScene) -> np.ndarray:
-    """(M,) bool: surfels that surround the content and shut out the light; none of them in most scenes.
+    """(M,) bool: surfels that surround the content and shut out the light; in most scenes, none.
 
-    Costs a sort of distances; rays, 1,024 of them, only where there is a gap.
+    The cost is a sort of distances and, only if there is a gap, 1,024 rays.
 
     Args:
         scene: the surfels, world, and which way is up.
@@ -71,7 +71,7 @@ def find_surroundings(scene: GaussianScene) -> np.ndarray:
 
 
 def _content_radius(distance: np.ndarray, size: np.ndarray) -> float | None:
-    """Distance from the middle within which the content is, where a gap lies beyond it; None where none does.
+    """Distance from the middle that encloses the content, if a gap lies beyond it; else None.
 
     Args:
         distance: (N,) of surfels from the middle. size: (N,) their larger standard deviations.
@@ -97,7 +97,7 @@ def _content_radius(distance: np.ndarray, size: np.ndarray) -> float | None:
 
 
 def _reached(scene: GaussianScene, outer: np.ndarray, middle: np.ndarray) -> float | None:
-    """Median distance at which rays overhead end at the outer surfels; None where too few do."""
+    """Median distance at which overhead rays end at the outer surfels; None if too few do."""
     rng = generator(0, "surroundings")
     near = np.flatnonzero(~outer & (scene.opacities() > _SOLID))
     origins = np.vstack([middle, scene.means[rng.choice(near, _ORIGINS - 1)]]).astype(np.float64)

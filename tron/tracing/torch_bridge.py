@@ -1,6 +1,6 @@
-"""Surfels held by torch, rendered by Dr.Jit: losses and optimisers of torch drive the tracer.
+"""Surfels held by torch, rendered by Dr.Jit: torch's losses and optimisers drive the tracer.
 
-One step of a reconstruction reads::
+One step of a reconstruction::
 
     surfels = tensors_of(scene)                                   # or dict(an nn.ParameterDict)
     optimiser = torch.optim.Adam(surfels.values(), 1e-3, eps=1e-15)
@@ -13,8 +13,8 @@ One step of a reconstruction reads::
 
 Nothing is copied on the way in: Dr.Jit reads the tensors' own memory, so they may be changed in place between
 steps, as optimisers do, but not between a rendering and its backward pass. Kernels are compiled at the first
-step and for no later view. Another number of surfels compiles the small one that unpacks gradients, and the
-one that replays hits when it has grown by a quarter of its octave.
+step and for no later view. A new number of surfels recompiles the small kernel that unpacks gradients, and,
+after growth by a quarter octave, the kernel that replays hits.
 """
 
 from __future__ import annotations
@@ -43,9 +43,9 @@ IMAGES = (
 
 
 def tensors_of(scene: GaussianScene) -> dict[str, torch.Tensor]:
-    """A scene's parameters as leaves that require gradients, on the device of the active variant.
+    """A scene's parameters as leaf tensors that require gradients, on the device of the active variant.
 
-    They are under the names of :data:`PARAMETERS`.
+    The keys are the names in :data:`PARAMETERS`.
     """
     on = {"device": torch_device(), "requires_grad": True}
     return {name: torch.tensor(getattr(scene, name), **on) for name in PARAMETERS}
@@ -54,7 +54,7 @@ def tensors_of(scene: GaussianScene) -> dict[str, torch.Tensor]:
 def render(
     surfels: Mapping[str, torch.Tensor], camera: Camera, *, kernel_degree: int = 2, sh_degree: int = 3
 ) -> dict[str, torch.Tensor]:
-    """View of ``camera``, differentiable by every tensor that requires gradients.
+    """Render the view of ``camera``, differentiable by every tensor that requires gradients.
 
     Args:
         surfels: contiguous float32 tensors on the device of the active variant, named and shaped as the
@@ -67,8 +67,8 @@ def render(
     Returns:
         The fields of :class:`tron.tracing.surface.Surface`: rgb, normal, normal_sum, base_color and position
         (H, W, 3); opacity, roughness, metallic and depth (H, W). rgb is premultiplied by opacity, over black.
-        depth has no gradient; position has one where it is at the mean depth. The normal is the mean over a
-        pixel, where tensors have gradients.
+        depth has no gradient; position has one where it lies at the mean depth. If tensors have gradients,
+        the normal is the mean over a pixel.
 
     Raises:
         TronError: a tensor is missing, or has another shape, dtype, layout or device than the ones above.
@@ -86,7 +86,7 @@ def render(
         seen = trace_gbuffer(records, build_tiles(records.detached(), camera), camera).rows()
         return {name: _image(getattr(seen, name), camera) for name in IMAGES}
 
-    # The bridge knows tensors but not their subclasses, such as nn.Parameter: a view is a plain tensor.
+    # Dr.Jit's bridge rejects subclasses of Tensor such as nn.Parameter: a view is a plain tensor.
     plain = {name: surfels[name].view(surfels[name].shape) for name in PARAMETERS}
     return dr.wrap(source="torch", target="drjit")(traced)(plain)
 
@@ -98,7 +98,7 @@ def _image(value: Any, camera: Camera) -> mi.TensorXf:
 
 
 def _check(surfels: Mapping[str, torch.Tensor]) -> int:
-    """The number of surfels, if every tensor is as the tracer can read it in place."""
+    """Check that the tracer can read every tensor in place; return the number of surfels."""
     device = torch_device()
     for name in PARAMETERS:
         if name not in surfels:

@@ -1,4 +1,4 @@
-"""SurfelTracer: a scene made ready for camera rays (by tiles) and shadow rays (by a hierarchy)."""
+"""SurfelTracer: a scene prepared for camera rays (by tiles) and shadow rays (by a hierarchy)."""
 
 from __future__ import annotations
 
@@ -31,20 +31,20 @@ if TYPE_CHECKING:
 
 
 _PLACES = ("means", "quats", "log_scales", "opacity_logits")
-"""What says where surfels are, and how far they reach."""
+"""The parameters that determine the place and extent of surfels."""
 LOOSE_BOXES = 1.5
-"""A hierarchy is built anew once its boxes' area is this many times what it was when it was last built."""
+"""A hierarchy is rebuilt once its boxes' area has grown by this factor since it was built."""
 
 
 class SurfelTracer:
     """Traces one :class:`GaussianScene`, uploaded and sorted into a hierarchy at once.
 
     Args:
-        scene: the surfels; must be valid (``scene.validate()``), and must not change while the tracer lives:
-            for surfels that move there is :meth:`moved`.
-        parameters: traced instead of the scene's own arrays; results are differentiable by those of them that
-            have gradients enabled, as often as they are asked for. After new values, :meth:`update`.
-        backdrop: (M,) bool, surfels that cameras see and no other ray meets; None: every ray meets all.
+        scene: the surfels; must be valid (``scene.validate()``) and must not change while the tracer lives
+            (:meth:`moved` makes a tracer of moved surfels).
+        parameters: traced instead of the scene's own arrays; results are differentiable, repeatedly, by those
+            with gradients enabled. Call :meth:`update` after changing values.
+        backdrop: (M,) bool, surfels that only cameras see; None: every ray meets all surfels.
 
     Attributes:
         records: the surfels as every kernel reads them, without gradients. bvh: their hierarchy.
@@ -61,16 +61,16 @@ class SurfelTracer:
         self.scene, self._parameters, self._backdrop = scene, parameters, backdrop
         self.emission = _emission(scene)
         self.records = pack(parameters or SurfelParameters.from_scene(scene)).detached()
-        # Not built when first needed: that may be inside a recorded loop, where nothing can be evaluated.
+        # Not built on demand: that may be inside a recorded loop, where nothing can be evaluated.
         self.bvh = build_bvh(self._met())
         self._sorted_area = self.bvh.area
         self._two_sided, self._beyond = True, BackFaces.of(self.records, scene.spacing)
 
     def moved(self, scene: GaussianScene) -> SurfelTracer:
-        """A tracer of the same surfels where they are now; this one goes on tracing where they were.
+        """Make a tracer of the same surfels at their new places; this tracer keeps the old ones.
 
-        Their order in the hierarchy is kept and its boxes are made anew, unless they have grown so loose that
-        sorting costs less than tracing on (``LOOSE_BOXES``).
+        The hierarchy keeps its order and recomputes its boxes; it is rebuilt once the boxes are so loose that
+        sorting anew costs less (``LOOSE_BOXES``).
 
         Args:
             scene: as many surfels, in the same order (:func:`tron.gaussians.edit.moved`).
@@ -91,16 +91,16 @@ class SurfelTracer:
         if scene.emission is not before.emission:
             other.emission = _emission(scene)
         stay = all(np.array_equal(getattr(scene, name), getattr(before, name)) for name in _PLACES)
-        if stay and scene.kernel_degree == before.kernel_degree:  # the hierarchy is of places alone
+        if stay and scene.kernel_degree == before.kernel_degree:  # the hierarchy depends on places alone
             other.records = records
         else:
             other._take(records)
         return other
 
     def sided(self, two_sided: bool) -> Self:
-        """The same surfels for shadow rays of other sides: back faces block beyond two spacings, or never.
+        """The same surfels under a rule for shadow rays: back faces block beyond two spacings, or never.
 
-        A new tracer lets them block; that they never do is the paper's rule. Ask again after :meth:`update`.
+        By default they block; the paper's rule is that they never do. Call it again after :meth:`update`.
         """
         if two_sided == self._two_sided:
             return self
@@ -109,9 +109,9 @@ class SurfelTracer:
         return other
 
     def turned_over(self, which: np.ndarray | None = None) -> Self:
-        """The same surfels in the same hierarchy, sides exchanged; without gradients.
+        """The same surfels in the same hierarchy with front and back exchanged; without gradients.
 
-        ``which``: (M,) bool, those that are turned; None: all.
+        ``which``: (M,) bool, the surfels to turn over; None: all.
         """
         which = np.ones(len(self.scene), bool) if which is None else which
         other, turned = copy(self), mi.Bool(aligned(which))
@@ -122,7 +122,7 @@ class SurfelTracer:
         return other
 
     def update(self) -> None:
-        """Take the new values of ``parameters``: as many surfels, which may have moved."""
+        """Read the new values of ``parameters``: the same number of surfels, which may have moved."""
         if self._parameters is not None:
             with dr.suspend_grad():
                 self._take(pack(self._parameters).detached())
@@ -135,7 +135,7 @@ class SurfelTracer:
             self._sorted_area = self.bvh.area
 
     def _met(self) -> SurfelRecords:
-        """The records that rays of no camera meet: those of the backdrop count nowhere."""
+        """The records for all rays but a camera's, in which surfels of the backdrop count nowhere."""
         if self._backdrop is None:
             return self.records
         geometry = dr.copy(self.records.geometry)
@@ -154,7 +154,7 @@ class SurfelTracer:
         return pack(self._parameters)
 
     def _with(self, values: Sequence[mi.Float]) -> SurfelRecords:
-        """The records with ``values`` to composite, and after them what the surfels emit, if any does."""
+        """The records with ``values`` to composite, followed by emission if any surfel emits."""
         glow = () if self.emission is None else self.emission
         return pack_values(self.attached(), [*values, *glow])
 
@@ -165,16 +165,16 @@ class SurfelTracer:
     def gbuffer(
         self, camera: Camera, values: Sequence[mi.Float] = (), limit: mi.Float | None = None
     ) -> GBuffer:
-        """Trace, composite and normalise what ``camera`` sees. Back-facing surfels are invisible to it.
+        """Trace, composite and normalise the view of ``camera``, to which back-facing surfels are invisible.
 
-        It sees the scene's ``projection`` of each surfel, as the viewer of a scan does, or disks in space.
+        Surfels are drawn by the scene's ``projection``, as a scan's own viewer does, or as disks in space.
 
         Args:
             camera: the view.
-            values: quantities of the surfels to composite as their materials are, each an array of one number
-                a surfel in the scene's order. They come back in ``GBuffer.values``, differentiable.
-            limit: distance along each ray, in tile order, beyond which no surfel counts, world units: what is
-                opaque there hides the rest; None: there is nothing.
+            values: quantities to composite like the materials, each an array of one number per surfel in the
+                scene's order. The results are in ``GBuffer.values``, differentiable.
+            limit: distance along each ray, in tile order, of an opaque surface that hides all surfels behind
+                it, world units; None: there is none.
         """
         records = self._with(values)
         projection = PROJECTIONS[self.scene.projection]
@@ -195,8 +195,8 @@ class SurfelTracer:
     ) -> Surface:
         """Surfaces along any rays, from ``origin`` along unit ``direction``; inactive lanes see nothing.
 
-        The same surfels composited in the same order as by :meth:`gbuffer`, without the coherence that makes
-        camera rays fast; ``values`` as there.
+        Composites the same surfels in the same order as :meth:`gbuffer`, with the same ``values``; slower,
+        because arbitrary rays lack the coherence of camera rays.
         """
         records = self._with(values)
         seen = trace_rays(records, self.bvh, origin, direction, mi.Bool(active))
@@ -210,10 +210,10 @@ class SurfelTracer:
         seeds: Sequence[mi.UInt32],
         normal: mi.Vector3f | None = None,
     ) -> list[FirstHit]:
-        """One surfel a ray, by chance, each as likely as its weight in compositing: see :mod:`.first_hit`.
+        """Draw one surfel per ray with the probability of its compositing weight: see :mod:`.first_hit`.
 
-        For a fan of rays from each origin, as :class:`Fans` says; sides count as for shadow rays. ``seeds``
-        of each ray: :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
+        Takes a fan of rays from each origin (:class:`Fans`); sides count as for shadow rays. ``seeds`` come
+        from :func:`tron.tracing.hierarchy.first_hit.ray_seeds`.
         """
         fans = Fans(origin, directions, active, mi.Vector3f(0) if normal is None else normal)
         return first_hits(self.bvh, fans, self.back_faces, seeds)
@@ -225,9 +225,9 @@ class SurfelTracer:
         return self.transmittances(Fans(origin, [direction], [mi.Bool(active)]))[0]
 
     def transmittances(self, fans: Fans) -> list[mi.Float]:
-        """The same for a fan of rays from each origin: quicker together, the more so the closer they are.
+        """Transmittance of a fan of rays from each origin; the closer its rays, the faster.
 
-        The other side of a thin sheet that they leave is not in their way. Evaluated at once, unless within a
+        The other side of a thin sheet that they leave does not block them. Evaluated at once, except within a
         recorded loop.
         """
         recorded = dr.flag(dr.JitFlag.SymbolicScope)
@@ -245,7 +245,7 @@ Seen = TypeVar("Seen", bound=Surface)
 
 
 def _with_emission(seen: Seen, emission: mi.Color3f | None) -> Seen:
-    """The last three of the values of surfels that glow are what they emit."""
+    """Move the last three values to the surface's emission, if surfels glow."""
     if emission is None:
         return seen
     return replace(seen, values=seen.values[:-3], emission=mi.Color3f(*seen.values[-3:]))
@@ -254,7 +254,7 @@ def _with_emission(seen: Seen, emission: mi.Color3f | None) -> Seen:
 def trace_rays(
     records: SurfelRecords, bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f, active: mi.Bool
 ) -> Surface:
-    """Trace, composite and normalise; differentiable in the records and, through SH alone, in ``direction``.
+    """Trace, composite and normalise; differentiable in the records and, only through SH, in ``direction``.
 
     Args:
         records: the surfels. bvh: their hierarchy.

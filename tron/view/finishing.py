@@ -1,8 +1,8 @@
-"""The last step of a picture at rest: what noise its passes have left is taken out.
+"""The last step of a picture at rest: remove the noise that remains after all passes.
 
-By a network that draws the picture of their buffers, or by a denoiser. Both look at the whole picture, and
-give it up as soon as it is out of date: a network between two of its layers; a denoiser, which cannot be
-interrupted, by leaving it to itself.
+Either a network draws the picture from the passes' buffers, or a denoiser filters it. Both process the whole
+picture and abandon it once it is out of date: a network between two of its layers; a denoiser, which cannot
+be interrupted, by letting it finish in the background.
 """
 
 from __future__ import annotations

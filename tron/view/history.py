@@ -13,7 +13,7 @@ from tron.editing import Edit, Insert, Separate
 from tron.view.stage import Wish
 
 HAND_SECONDS = 2.0
-"""Between two changes by one hand that are one edit: a slider that is dragged sends 20 a second."""
+"""Longest pause between changes that count as one edit: a dragged slider sends 20 a second."""
 LISTED = 4
 
 
@@ -62,7 +62,7 @@ class History:
             self._changed()
 
     def undo(self) -> None:
-        """Take the last edit back."""
+        """Undo the last edit."""
 
         if not self._wished().edits:
             self._list.content = "*no edit to undo; light and view are none*"
@@ -78,7 +78,7 @@ class History:
         self._changed()
 
     def redo(self) -> None:
-        """Do again what was undone last."""
+        """Redo the edit undone last."""
         if self._undone:
             with self._one:
                 edit, self._hand = self._undone.pop(), ""

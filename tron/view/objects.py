@@ -1,7 +1,7 @@
-"""The panel of the chosen object: which it is, its paint, whether it is seen, and where it stands.
+"""The panel of the chosen object: its name, material, visibility and place.
 
-Its controls say what the scene has after the edits of the wish, and are not there while no object is chosen:
-viser's sliders can be typed into even where they are disabled. A box around the object marks it.
+Its controls show the scene after the wish's edits and are absent while no object is chosen, because viser's
+sliders accept typed values even when disabled. A box around the object marks it.
 """
 
 from __future__ import annotations
@@ -166,7 +166,7 @@ class Objects:
             self.follow()
 
     def _mark(self, state: _State | None) -> None:
-        """The box, over the picture: it knows no depth."""
+        """Draw the box over the picture, without depth test."""
         if self._box is not None:
             self._box.remove()
             self._box = None
@@ -211,7 +211,7 @@ class Objects:
 
 
 def _of_user(act: Callable[[], Any]) -> Callable[[Any], Any]:
-    """A callback: what the server sets itself has no client, and wishes for nothing."""
+    """A callback that ignores values set by the server itself, which come without a client."""
     return lambda event: act() if event.client is not None else None
 
 

@@ -1,4 +1,4 @@
-"""What a window opens with: lights and models, the first light, what finishes pictures; in notebooks too."""
+"""Opening a window, also in notebooks: lights and models, the first light, the finish of pictures."""
 
 from __future__ import annotations
 
@@ -82,7 +82,7 @@ def first_light(lights: Mapping[str, Path], wanted: str | None, own: Collection[
 
 
 def finish_of(threads: int | None) -> Callable[[int, int], Finish | None]:
-    """What pictures at rest of a width and height are finished by.
+    """The finish for pictures at rest of a width and height.
 
     As checkpoint=auto of tron-relight has it, by the network or a denoiser, whichever surely gains more.
     Where none does a denoiser, if installed, still takes the passes' noise out.

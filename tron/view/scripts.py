@@ -1,4 +1,4 @@
-"""What viser has no control for, as HTML with scripts: what is dragged in the page, and a panel that folds.
+"""Controls that viser lacks, as HTML with scripts: draggable pictures, and a panel that folds.
 
 The light's picture and the divider of a picture of two move the slider of the same value, as a hand would,
 and follow it: the server knows the slider alone, and every client sees what another one drags.

@@ -1,8 +1,8 @@
-"""A scene as edits leave it, under one of some lights; brought to a wish with the least work.
+"""An edited scene under a chosen light, updated to a wish with the least work.
 
-What is rough is looked at while a hand is on it. What is not is that of a fresh stage which was given the
-same wish alone, whatever came before it: surfels that have moved get a new hierarchy, since rays go by it,
-and whether light sees a proxy is decided by the scene before all edits.
+Rough pictures are for dragging. All others equal those of a fresh stage with the same wish, independent of
+earlier wishes: moved surfels get a new hierarchy, because traversal depends on it, and the scene before all
+edits decides whether light sees a proxy.
 """
 
 from __future__ import annotations
@@ -40,9 +40,9 @@ EXPOSED = ("lit", "irradiance", "indirect")
 which stops make brighter.
 """
 Left = Literal["nothing", "before", "capture", "light"]
-"""What is seen left of the divider: the scene before all edits, its own look then, or another light."""
+"""Content left of the divider: the scene before all edits, its own captured look, or another light."""
 Quality = Literal["final", "preview"]
-"""How far pictures at rest go: through all passes, or no farther than the light that reached the surfels."""
+"""Quality of pictures at rest: all passes, or only the light baked at surfels."""
 PASS = FINEST.of_sub_pixel()
 """Estimation of each pass; all together are ``quality=final`` of tron-relight, but that a scan's splats are
 filtered by whole pixels here, and by the sub-pixels of tron-relight."""
@@ -61,7 +61,7 @@ MARKED = 0.55
 
 @dataclass(frozen=True)
 class Wish:
-    """What is to be seen, but for the camera; replaced whole.
+    """The wished state of the view, except the camera; immutable.
 
     Attributes:
         light: name of a light.
@@ -92,7 +92,7 @@ class Wish:
 
 @dataclass(frozen=True)
 class Part:
-    """A side of the divider, or all of a picture: what is seen there, and the camera that sees it."""
+    """One side of the divider, or the whole picture: its content and its camera."""
 
     left: bool
     before: bool
@@ -168,7 +168,7 @@ class Stage:
         self._left: Illumination | None = None
 
     def bring(self, wish: Wish, rough: bool) -> None:
-        """Do what is left to do for a wish.
+        """Update the stage to a wish.
 
         Args:
             wish: what is to be seen.
@@ -193,7 +193,7 @@ class Stage:
             self.selected(wish.marked)
 
     def parts(self, wish: Wish, camera: Camera) -> list[Part]:
-        """What a picture is made of, from left to right."""
+        """The parts of a picture, from left to right."""
         whole = Part(False, False, wish.buffer, wish.light, camera)
         column = 0 if wish.left == "nothing" else round(np.clip(wish.divider, 0, 1) * camera.width)
         if not column:
@@ -235,7 +235,7 @@ class Stage:
         return frame.images((part.buffer, *more))
 
     def finished(self, part: Part, means: Mapping[str, np.ndarray], finish: Finish) -> np.ndarray:
-        """(H, W, 3) linear radiance: the means of all passes over a part without the noise that is left."""
+        """(H, W, 3) linear radiance: the mean of all passes over a part, denoised."""
         relighter = self._base if part.before else self._relighter
         maps = []
         for window in bands(part.camera):

@@ -1,17 +1,17 @@
-"""What is wished for, and one thread that draws it: the only one that touches Dr.Jit.
+"""The wished state of a view, and the one thread that renders it: the only thread that uses Dr.Jit.
 
-Callers on any thread say what is to be seen (:meth:`Studio.wish`, :meth:`Studio.look`). The thread compares
-that with what it has done and does the next piece of work towards it:
+Callers on any thread set the wish (:meth:`Studio.wish`, :meth:`Studio.look`). The thread compares it with its
+own state and does the next piece of work towards it:
 
-    while a hand moves    the light that reached the surfels, by few rays, no shadow ray of a pixel; smaller
-                          where that takes long
-    at rest               the same of all rays, at full size
-    then                  four passes of 16 shadow rays a pixel, each on a sub-pixel of its own, averaged
-    at last               what noise they have left is taken out (:mod:`tron.view.finishing`)
+    while input arrives   light baked at surfels with few rays, no shadow rays per pixel; at a lower
+                          resolution if that is slow
+    at rest               the same with all rays, at full resolution
+    then                  four passes of 16 shadow rays per pixel, each on its own sub-pixel, averaged
+    at last               the remaining noise is removed (:mod:`tron.view.finishing`)
 
-A pass is given up, between two bands of the picture, as soon as it is of a wish that is past. Pictures at
-rest are handed out only while they are of the wish of the moment; the last of them is the same, to the bit
-with one thread of Dr.Jit, whatever was wished for before.
+A pass is cancelled, between two bands of the picture, as soon as its wish is out of date. Pictures at rest
+are delivered only while they match the current wish. The last of them does not depend on earlier wishes, to
+the bit with one thread of Dr.Jit.
 """
 
 from __future__ import annotations
@@ -42,13 +42,13 @@ Opener = Callable[[], tuple[GaussianScene, Mapping[str, Any] | None]]
 """Gives a scene, and what a stage is told of it."""
 
 REST_SECONDS = 0.25
-"""Since the last input, from which on nothing moves: inputs of a hand come faster, 20 a second."""
+"""Seconds after the last input from which the view is at rest: a dragging hand sends 20 inputs a second."""
 MOVING_SECONDS = 0.11
-"""Time that a picture may take while a hand moves, before the next ones are made smaller."""
+"""Longest time of a picture while input arrives; beyond it, the next ones get a lower resolution."""
 SMALLEST = 0.3
-"""Side of the smallest of them, of the full size."""
+"""Lowest such resolution, as a share of the full one."""
 WORKING = "working"
-"""What is said of a wish before more is known."""
+"""Status of a wish before more is known."""
 PASSED = 2 + len(SUB_PIXELS)
 """Level of a view after all passes: 0 of nothing, 1 of a rough picture, 2 of one at rest, then one a pass."""
 
@@ -60,7 +60,7 @@ holds its own lock; a second thread that computes meanwhile has Python's and wai
 
 @dataclass(frozen=True)
 class Picture:
-    """What a view shows.
+    """A rendered picture of a view.
 
     Attributes:
         image: (H, W, 3) uint8.
@@ -154,7 +154,7 @@ class Studio:
 
     @property
     def wished(self) -> Wish:
-        """The wish of the moment."""
+        """The current wish."""
         with self._changed:
             return self._wish
 
@@ -164,12 +164,12 @@ class Studio:
             return self._want(replace(self._wish, **changes))
 
     def change(self, of: Callable[[Wish], Wish]) -> Wish:
-        """The same where the new wish depends on the old one; nothing comes between them."""
+        """Change the wish by a function of the old one, atomically."""
         with self._changed:
             return self._want(of(self._wish))
 
     def look(self, view: int, camera: Camera | None) -> None:
-        """Say what a view looks from, up being +z; None: nobody looks any more."""
+        """Set a view's camera, +z up; None: the view is closed."""
         with self._changed:
             if camera is None:
                 self._views.pop(view, None)
@@ -184,9 +184,9 @@ class Studio:
             self._changed.notify()
 
     def ask(self, question: Callable[[Stage], T]) -> Future[T]:
-        """Let the studio's thread answer a question between two pieces, the wish of the moment done.
+        """Let the studio's thread answer a question between two pieces of work, once the wish is met.
 
-        It may take as long as that wish does. Where it cannot be done, the question is not answered.
+        It may take as long as that wish. If the wish cannot be met, the question is not answered.
         """
         answer: Future[T] = Future()
         with self._changed:
@@ -199,10 +199,10 @@ class Studio:
         return answer
 
     def reopen(self, of: Opener) -> None:
-        """Show another scene from now on, of as many surfels; wishes, edits among them, are done to it.
+        """Switch to another scene with as many surfels; wishes, including edits, are applied to it.
 
         Args:
-            of: called on the studio's thread. Where it fails that is a notice, and what was shown goes on.
+            of: called on the studio's thread. If it fails, a notice is given and the old scene stays.
         """
         with self._changed:
             self._of, self._refused = of, None
@@ -213,7 +213,7 @@ class Studio:
             self._changed.notify()
 
     def close(self) -> None:
-        """End the thread; what is under way is given up. Safe to repeat."""
+        """End the thread and cancel its work. Safe to repeat."""
         with self._changed:
             self._closing = True
             self._version += 1
@@ -262,7 +262,7 @@ class Studio:
                 self._refuse(wish, number, str(error) or type(error).__name__)
 
     def _other(self, of: Opener, stage: Stage) -> Stage:
-        """A stage of another scene; where it cannot be opened that is said, and the one before goes on."""
+        """A stage of another scene; if it cannot be opened, notify and keep the old one."""
         try:
             return self._make(*of())
         except Exception as error:
@@ -276,7 +276,7 @@ class Studio:
                     self._of = None
 
     def _wait(self) -> None:
-        """Until there is something to do; holds the lock."""
+        """Wait for work; holds the lock."""
         while not self._closing and not self._asked:
             left = self._moved + REST_SECONDS - time.perf_counter()
             levels = [
@@ -290,7 +290,7 @@ class Studio:
                 return
 
     def _work(self, stage: Stage, wish: Wish, number: int, rough: bool) -> None:
-        """The next piece of work: questions first, then a picture of the view that has least."""
+        """The next piece of work: questions first, then a picture for the least refined view."""
         if wish != self._refused:
             self._bringing = number
             try:
@@ -378,7 +378,7 @@ class Studio:
         return {name: np.concatenate([each[name] for each in found]) for name in found[0]}
 
     def _finished(self, stage: Stage, part: Part, sums: dict[str, np.ndarray]) -> np.ndarray:
-        """A part after all passes, its noise taken out where there is something that does."""
+        """A part after all passes, denoised if a finish is available."""
         means = {name: each / np.float32(PASSED - 2) for name, each in sums.items()}
         finish = self._finish_of(part)
         if finish is None:
@@ -396,7 +396,7 @@ class Studio:
         return self._finish(part.camera.width, part.camera.height) if part.buffer == "lit" else None
 
     def _last(self, view: _View, wish: Wish) -> int:
-        """Level of a view that is done."""
+        """Level of a finished view."""
         if wish.quality == "preview":
             return 2
         finish = self._finish(view.camera.width, view.camera.height) if wish.buffer == "lit" else None
@@ -414,7 +414,7 @@ class Studio:
                 raise _Outdated
 
     def _refuse(self, wish: Wish, number: int, why: str) -> None:
-        """Go back to what could be done last, and say so."""
+        """Return to the last wish that could be met, and notify."""
         with self._changed:
             if self._wish == wish and self._done is not None and self._done != wish:
                 self._want(self._done)

@@ -1,7 +1,7 @@
-"""The window of a studio in a browser, by viser: controls that say what is wished for, and its pictures.
+"""The window of a studio in a browser, by viser: controls that set the wish, and its pictures.
 
-Every client has its own camera and its own picture; the scene, its edits and the light are shared. Nothing is
-read but what the window was given by name, and nothing is written outside its folder.
+Every client has its own camera and its own picture; the scene, its edits and the light are shared. The window
+reads only files that it was given by name, and writes only into its folder.
 """
 
 from __future__ import annotations
@@ -51,7 +51,7 @@ SIDES: dict[str, tuple[Left, str]] = {
 }
 """What may be left of the divider besides other lights."""
 ABOVE = 4.0
-"""Spacings above a point that was clicked from which what is inserted is lowered."""
+"""Height in spacings above a clicked point from which an inserted object is lowered."""
 EVERYWHERE = "0.0.0.0"
 """Host that stands for all addresses of the machine."""
 GUESSED = "*Materials are guessed from the scan's colours, which keep the light of its capture.*"

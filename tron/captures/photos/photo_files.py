@@ -50,7 +50,7 @@ class PhotoHeader:
 
     Attributes:
         width: pixels as stored, before any turning.
-        height: likewise.
+        height: pixels as stored.
         alpha: whether it has transparency.
         orientation: EXIF's 1 to 8; 1 is upright as stored.
         linear: whether it holds linear radiance, not display values.

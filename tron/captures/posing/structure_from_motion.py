@@ -60,7 +60,7 @@ _NEAREST = 16
 _FEWEST = 3
 _QUALITY = 95
 _PANORAMA = "panorama_"
-"""What folders of equirectangular copies begin with."""
+"""Prefix of the folders of equirectangular copies."""
 _PANORAMA_SIDE = 3
 """Times the pixels a side of other copies: all around is six usual views wide; features need half of that."""
 
@@ -185,7 +185,7 @@ def _copy(
     exr_exposure: float | None = None,
     panoramas: Collection[Path] = (),
 ) -> dict[str, str]:
-    """Write upright 8-bit copies, those of one camera into one folder; their names below ``folder``."""
+    """Write upright 8-bit copies, one folder per camera; return their names below ``folder``."""
     exposure = exposure_of(photos, exr_exposure)
     cameras: dict[tuple[Any, ...], str] = {}
     copies = {}
@@ -306,7 +306,7 @@ def _map(workspace: Path, count: int, settings: PosingSettings) -> None:
 
 
 def _write_pairs(database: Path, file: Path) -> int:
-    """Write COLMAP's list of the pairs that are likely to overlap; their number."""
+    """Write COLMAP's list of the pairs that are likely to overlap; return their number."""
     descriptors = coarse_descriptors(database)
     names = list(descriptors)
     pairs = overlapping_pairs(list(descriptors.values()), _NEAREST)

@@ -1,12 +1,12 @@
-"""Normals that the surfels' own depths agree on: they shape surfaces in stage 1 where no prior gives any.
+"""Fused normals of the surfels' own depths, which shape surfaces in stage 1 if no prior gives normals.
 
-Every so many steps the median depths of all training views are rendered and fused
-(:mod:`tron.tracing.fusion`), and each view takes the normals of the fused surface back. Until the next time
-they are what the surfels' normals are pulled to by 2DGS's normal consistency (Huang et al. 2024, equation 14)
+At regular intervals the median depths of all training views are rendered and fused
+(:mod:`tron.tracing.fusion`), and each view reads the normals of the fused surface. Until the next fusion, the
+surfels' normals are pulled to them by 2DGS's normal consistency (Huang et al. 2024, equation 14)
 
     mean over pixels of sum_i w_i (1 - n_i . N) = opacity - (sum_i w_i n_i) . N,
 
-with N fixed: 2DGS takes it from the depth of the one view, which is noise until depth is right.
+with N fixed; 2DGS takes N from the depth of the single view, which is noisy until depth is right.
 """
 
 from __future__ import annotations
@@ -41,10 +41,9 @@ def normal_consistency(rendered: Mapping[str, Tensor], fused: Tensor) -> Tensor:
 
 
 class FusedNormals:
-    """The fused normals of the training views, made anew as the surfels change.
+    """The fused normals of the training views, recomputed as the surfels change.
 
-    They are a function of the surfels' geometry when they were last made, which is what a checkpoint keeps of
-    them.
+    They are a function of the surfels' geometry at the last fusion, so a checkpoint stores that geometry.
 
     Args:
         settings: how often, how fine.
@@ -57,7 +56,7 @@ class FusedNormals:
         self._made_from: dict[str, Tensor] = {}
 
     def make(self, surfels: LearntSurfels, views: Sequence[View]) -> None:
-        """Make them anew, in the views' size."""
+        """Recompute them at the views' size."""
         self._make({name: surfels[name].detach().clone() for name in _GEOMETRY}, views)
 
     def of(self, view: View) -> dict[str, Tensor]:
@@ -66,7 +65,7 @@ class FusedNormals:
         return {} if normals is None else {"fused_normal": normals.float()}
 
     def state(self) -> dict[str, Tensor]:
-        """The geometry that they were made from, for a checkpoint."""
+        """The geometry that was fused, for a checkpoint."""
         return {f"{_STATE}{name}": values for name, values in self._made_from.items()}
 
     def restore(self, stored: Mapping[str, Tensor], device: torch.device, views: Sequence[View]) -> None:

@@ -37,7 +37,7 @@ _SOME = 10_000  # points that tell how far away they all are
 _DENSE = 2.0  # pixels between points that cover surfaces; structure from motion's lie farther apart
 _FEWEST = 0.05  # share of pixels with a confirmed depth below which stereo has found nothing but chance
 _SUBJECT = 0.5
-# A few pixels a surfel say all that surfels of that size can hold.
+# A few pixels per surfel suffice for surfels of that size.
 _PIXELS_PER_SURFEL = 64
 
 
@@ -48,8 +48,8 @@ class Beginning:
     Attributes:
         scene: the surfels.
         source: of them.
-        confident: share of the subject's pixels whose depth stereo found and other photos confirm; None where
-            stereo was not asked.
+        confident: share of the subject's pixels whose depth stereo found and other photos confirm; None
+            without stereo.
     """
 
     scene: GaussianScene
@@ -58,12 +58,12 @@ class Beginning:
 
     @property
     def place(self) -> Place:
-        """Distance that the surfels may have to go."""
+        """How far the surfels may have to move."""
         return place_of(self.source)
 
 
 def place_of(source: Source) -> Place:
-    """Distance that surfels of a source may have to go."""
+    """How far surfels of a source may have to move."""
     return {"depth": "in place", "stereo": "near"}.get(source, "anywhere")
 
 
@@ -148,7 +148,7 @@ def beginning(
 
 
 def _dense(capture: Capture) -> bool:
-    """Whether a capture's points lie as near to one another as surfels must: on surfaces, not on corners."""
+    """Whether a capture's points are dense enough for surfels: on surfaces, not only on corners."""
     points = capture.points
     if points is None or len(points) < 4:
         return False

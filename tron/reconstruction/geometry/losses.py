@@ -1,9 +1,9 @@
-"""Loss of stages 1 and 2: how far the surfels are from what a view shows.
+"""Loss of stages 1 and 2: the difference between the surfels' maps and a view's.
 
-Both stages compare with the same loss, (1 - w) L1 + w (1 - SSIM); they differ in which maps are compared and
-in which parameters may answer. Colours are composited over a background, the photo's by its mask, the
-surfels' by their opacity. Normals are compared as they come, faded by opacity, so that a wanted normal also
-asks for a surface; materials only where there is one, because their geometry is frozen.
+Both stages use the same loss, (1 - w) L1 + w (1 - SSIM); they differ in the maps compared and the parameters
+learnt. Colours are composited over a background, the photo's by its mask, the surfels' by their opacity.
+Normals are compared with their weight by opacity, so that a target normal also pulls opacity up; materials
+are compared only on surfaces, because their geometry is frozen.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Weights:
     consistency: float = 0.0
 
     def wanted(self) -> tuple[str, ...]:
-        """The maps of a view that count, the mask and what is to be believed always among them."""
+        """The maps of a view that count, always including ``mask`` and ``valid``."""
         names = [name for name in _COMPARED if getattr(self, "rgb" if name == "image" else name) > 0]
         return (*names, "mask", "valid")
 
@@ -68,7 +68,7 @@ def loss_of(
     Args:
         rendered: images of :func:`tron.tracing.torch_bridge.render`.
         target: the view's maps (see :func:`targets`), and ``fused_normal`` (see :mod:`.consistency`).
-        weights: what counts.
+        weights: of the maps.
         background: (3,) display colour behind the surfels.
     """
     opacity, mask, valid = rendered["opacity"], target.get("mask"), target.get("valid")
@@ -108,7 +108,7 @@ def pictures(
 
 
 def _normal_loss(rendered: Mapping[str, Tensor], target: Mapping[str, Tensor], ssim: float) -> Tensor:
-    """Normals as colours, (n + 1) / 2; pixels whose normal nobody knows do not count."""
+    """Loss of normals as colours, (n + 1) / 2; pixels with an unknown normal do not count."""
     wanted = target["normal"]
     known = (wanted * wanted).sum(-1) > 0.25
     if "mask" in target:  # beside the subject is no surface, whatever a prior sees there

@@ -1,4 +1,4 @@
-"""Likeness of two photographs where a surface at some distance would show the same in both.
+"""Matching cost of two photographs for hypothetical distances along a pixel's ray.
 
 A pixel of one photograph and a distance along its ray make a point; the other photograph shows that point
 somewhere. Windows around the two places are compared by half 1 - ZNCC of their greys, which is blind to
@@ -115,7 +115,7 @@ def matching_cost(reference: Photograph, other: Photograph, distances: Tensor, r
 
     Args:
         reference: the photograph whose distances are sought.
-        other: the one that it is compared with.
+        other: the photograph to compare with.
         distances: (K, H, W) along the unit rays, world units.
         radius: of the windows, pixels.
 
@@ -146,7 +146,7 @@ def matching_cost(reference: Photograph, other: Photograph, distances: Tensor, r
 def agreed_cost(
     reference: Photograph, others: list[Photograph], distances: Tensor, radius: int, best: int
 ) -> Tensor:
-    """Mean cost of the ``best`` of the other photographs, (K, H, W): those that something hides drop out."""
+    """Mean cost over the ``best`` other photographs, (K, H, W), so that occluded ones drop out."""
     costs = torch.stack([matching_cost(reference, other, distances, radius) for other in others])
     return costs.topk(min(best, len(others)), 0, largest=False, sorted=False).values.mean(0)
 

@@ -1,10 +1,9 @@
-"""Windows of a room, by what photos show where its bounds are.
+"""Find the windows of a room from the photos' colours at its bounds.
 
-What a window lights is darker than the window, but a white ceiling under which all else is grey, or the sun
-on a wall, may be as bright as what is outside. Photos tell them apart in two ways. What lies far behind the
-bounds moves over them as the camera does (parallax): photos agree by direction, not by place. And the sky is
-white in photos that are exposed for a room. What is bright and neither moves nor is white is taken for a
-wall: a wall lost is worse than a window shut.
+A window is brighter than the surfaces it lights, but a white ceiling in a grey room, or the sun on a wall,
+may be as bright as the outside. Photos tell these apart in two ways. Objects far behind the bounds show
+parallax: photos agree by direction, not by place. And the sky is white in photos exposed for a room. A bright
+place with neither parallax nor white is taken for a wall, because a lost wall is worse than a closed window.
 """
 
 from __future__ import annotations
@@ -30,7 +29,7 @@ from tron.tracing import SurfelTracer
 SHINES = 2.0
 """Least luminance of a window, in medians of the surfels."""
 HALF_A_SIDE = 0.5
-"""Share of a side that white photos may open: more is an overexposed wall, for all one knows."""
+"""Largest share of a side that white photos may open; more may be an overexposed wall."""
 _REGION = 24  # neighbours whose median luminance counts: windows are larger than a surfel
 _AROUND = 200  # neighbours whose parallax counts: an edge of what is outside is in sight
 _FAR = 0.9  # of the disagreement by place, that by direction of what is far
@@ -51,7 +50,7 @@ _ENOUGH = 50  # pixels that tell a photo's exposure
 
 @dataclass(frozen=True, eq=False)
 class Shown:
-    """What V photos show at N points.
+    """Colours of N points in V photos.
 
     Attributes:
         light: (V, N, 3) linear, exposure and white balance divided out; NaN where a photo does not show it.
@@ -67,7 +66,7 @@ class Shown:
 
 
 def radiance_of(scene: GaussianScene, curve: ToneCurve) -> np.ndarray:
-    """(M, 3) linear light that surfels send out in the mean of all directions, white is 1."""
+    """(M, 3) linear radiance of surfels, averaged over all directions; white is 1."""
     return decoded(np.clip(SH_C0 * scene.sh[:, 0] + 0.5, 0, 1), curve)
 
 
@@ -86,9 +85,9 @@ def gbuffers_of(
 def shown_at(
     views: Sequence[View], seen: Sequence[Mapping[str, np.ndarray]], points: np.ndarray, curve: ToneCurve
 ) -> Shown:
-    """What photos show at points (N, 3), each divided by its exposure and white balance.
+    """Colours of points (N, 3) in the photos, divided by each photo's exposure and white balance.
 
-    These are the median ratio of its pixels to what the surfels show there.
+    These are the median ratio of a photo's pixels to the surfels' picture.
 
     Args:
         views: photos. seen: :func:`gbuffers_of` them. points: world. curve: of the photos.
@@ -120,7 +119,7 @@ def shining(
     usual: float,
     up: np.ndarray,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(N,) bool: samples of a room's bounds through which light comes in, and those as bright that stay shut.
+    """(N,) bool twice: samples of a room's bounds that are windows, and equally bright ones that stay closed.
 
     Args:
         points, normals: (N, 3), normals unit, inwards.
@@ -211,8 +210,8 @@ def opened(
 ) -> GaussianScene:
     """The scene without surfels that stand in its windows with the sky painted on them.
 
-    Those go that most photos that show them have before a window, as bright as one, or behind it. Frames are
-    dark and stay; a lamp within the room is before walls too, and stays.
+    A surfel is removed if most photos that show it see it in front of a window and as bright, or behind the
+    window. Window frames are dark and stay; a lamp in the room is also seen in front of walls, and stays.
 
     Args:
         scene: surfels.
@@ -239,7 +238,7 @@ def opened(
 
 
 def visible_in(view: View, seen: Mapping[str, np.ndarray], points: np.ndarray) -> np.ndarray:
-    """(N,) bool: points that a view shows, or would but for what is close before them.
+    """(N,) bool: points that a view shows, or would show without surfels close in front of them.
 
     Args:
         view: its image is not looked at. seen: its G-buffer. points: (N, 3) world.

@@ -1,13 +1,13 @@
-"""Bounds of a room where no photo looked, and whether photos were taken in one.
+"""Close a room where no photo looked, and decide whether photos were taken in one.
 
-By a ceiling that nobody filmed a new light would shine in, and windows in which surfels show the sky keep it
-out. The convex hull of surfels and cameras is sampled. What photos show there bright, and far away or white,
-is a window (:mod:`tron.reconstruction.geometry.openings`): its surfels go. Where a camera's position sees
-through no surfel, and its photo shows no window either, there is a wall. It gets the colour that photos show,
-or where none looks the mean colour of the surfels near by.
+A new light would shine in through a ceiling that nobody filmed, and be blocked by surfels that show the sky
+in windows. The convex hull of surfels and cameras is sampled. Samples that photos show bright, and far away
+or white, are windows (:mod:`tron.reconstruction.geometry.openings`): their surfels are removed. If a camera
+meets no surfel towards a sample, and no photo shows a window there, a wall is added. It gets its colour from
+the photos, or without a photo the mean colour of the nearest surfels.
 
-Cameras are in a room where surfels stand around them on all sides, some of them overhead, and photos show few
-openings there. Of a place among trees that is filmed from above nobody can tell.
+Cameras are in a room if surfels surround them on all sides, some of them overhead, and photos show few
+openings overhead. A place among trees filmed from above cannot be decided.
 """
 
 from __future__ import annotations
@@ -85,15 +85,15 @@ class Bounds:
         points: (N, 3) world.
         normals: (N, 3) unit, inwards.
         spacing: mean distance between them, world units.
-        lacking: (N,) bool, where a camera sees no surfel and no photo looks.
-        pictured: (N,) bool, where a camera sees no surfel and its photo has it in the picture.
-        shown: (N, 3) linear light that photos show there; NaN where none does.
-        shines: (N,) bool, where that is light from without.
-        shut: (N,) bool, where it is as bright, and nothing says that it is light from without.
-        seen: what surfels show and hide in each photo, of :func:`gbuffers_of`.
+        lacking: (N,) bool, a camera meets no surfel there and no photo shows it.
+        pictured: (N,) bool, a camera meets no surfel there and its photo shows it.
+        shown: (N, 3) linear colour in the photos; NaN if none shows it.
+        shines: (N,) bool, the sample is a window.
+        shut: (N,) bool, the sample is as bright as a window but nothing proves one.
+        seen: the surfels' G-buffer in each photo, of :func:`gbuffers_of`.
         around: share of the level directions from the cameras that end on a surfel.
-        over: the same of the rising ones.
-        overhead: share of the samples overhead that are pictured, as bright as the surfels at least.
+        over: share of the rising directions that end on a surfel.
+        overhead: share of the overhead samples that are pictured and at least as bright as the surfels.
     """
 
     points: np.ndarray
@@ -111,7 +111,7 @@ class Bounds:
 
     @property
     def room(self) -> bool | None:
-        """Whether these are the bounds of a room; None where nobody can tell."""
+        """Whether these are the bounds of a room; None if undecided."""
         if self.overhead > OVERHEAD or self.around < PERHAPS:
             return False
         return True if self.around >= AROUND and self.over >= OVER else None
@@ -185,7 +185,7 @@ def closed_indoors(
 
 
 def _small(view: View) -> View:
-    """The view with all that is looked at read, and reduced."""
+    """The view with all needed maps read and reduced."""
     small = view.reduced(max(max(view.camera.width, view.camera.height) / _SIDE, 1))
     maps = {name: small.read(name) for name in ("image", "valid", "sky_mask") if small.has(name)}
     return View(small.name, small.camera, space=small.space, **maps)

@@ -1,8 +1,8 @@
-"""Geometry of photographs without any prior: plane sweep, fusion, and what all views agree on.
+"""Geometry from photographs without any prior: plane sweep, fusion, and consensus of the views.
 
 Each photograph's depth comes from its neighbours (:func:`swept`), depths that other photographs do not
 confirm are dropped, the rest is fused (:mod:`tron.tracing.fusion`), and each view takes its depth and normals
-back from the fused field. Photos, poses, masks and, where there are any, sparse points are all that is used.
+back from the fused field. Only photos, poses, masks and, if available, sparse points are used.
 
 The sweep is from "A space-sweep approach to true multi-image matching" (Collins 1996): planes through space,
 even in inverse distance, on each of which every pixel is compared with where the neighbouring photographs see
@@ -82,7 +82,7 @@ def stereo_maps(
     Args:
         capture: at least two training views, display images.
         settings: of sweep and fusion.
-        seed: root of the points that bound the planes where the capture has none.
+        seed: root of random points that bound the planes, if the capture has no points.
         track: shows progress.
 
     Raises:
@@ -124,7 +124,7 @@ def stereo_maps(
 
 
 def most_side(views: Sequence[View], wanted: int) -> int:
-    """Longest side that photographs are reduced to: less than wanted where there are very many."""
+    """Longest side that photographs are reduced to; below the wanted one if there are very many."""
     longest = [max(view.camera.width, view.camera.height) for view in views]
     pixels = sum(
         view.camera.width * view.camera.height * min(wanted / side, 1) ** 2
@@ -254,7 +254,7 @@ def _confirmed(
     for k in beside:
         other = photographs[k]
         pixels, z = project(other.camera, points)
-        # Nearest, because a mean over an edge is a depth at which nothing is.
+        # Nearest, because a mean over an edge lies on no surface.
         theirs = sample((found[k].depth * other.along)[None], pixels[None], "nearest")[0, 0]
         known = (theirs > 0) & (z > 0)
         gap = (1 / torch.where(known, z, 1.0) - 1 / torch.where(known, theirs, 1.0)).abs()

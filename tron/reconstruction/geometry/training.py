@@ -1,8 +1,8 @@
-"""The optimisation loop of stages 1 and 2: one view a step, Adam, density control, a guard against NaN.
+"""The optimisation loop of stages 1 and 2: one view per step, Adam, density control, a guard against NaN.
 
-A run is a function of its settings, its seed and the step: views come in a random order drawn anew each time
-all have been seen, so that a run that goes on from a checkpoint repeats the one that was never interrupted,
-bit by bit with one Dr.Jit and one torch thread.
+A run is a function of its settings, its seed and the step: views come in a random order, drawn again once all
+have been seen. So a run resumed from a checkpoint repeats the uninterrupted one, bit by bit with one Dr.Jit
+and one torch thread.
 """
 
 from __future__ import annotations
@@ -40,8 +40,8 @@ _EXPOSURES_FROM = 0.1
 # Of "3D Gaussian Splatting" (Kerbl et al. 2023): scale over the extent up to which surfels are cloned, larger
 # ones are split; divisor of split ones' scales; opacity that others are pruned below; opacity after a reset.
 _CLONE_BELOW, _SPLIT_SHRINK, _PRUNE_BELOW, _RESET_TO = 0.01, 1.6, 0.005, 0.01
-# Of views, kept on a GPU, and no more than a quarter of what is free: what is read, checked and reduced for
-# each step on the host leaves it idle.
+# Of views cached on a GPU, at most a quarter of its free memory: reading, checking and reducing views on the
+# host at each step would leave the GPU idle.
 _KEPT_ON_DEVICE = 8 << 30
 
 
@@ -74,21 +74,21 @@ Watch = Callable[[StepSummary, "Stage"], None]
 
 @dataclass(frozen=True)
 class Plan:
-    """Stage as the loop sees it.
+    """Settings of one stage for the loop.
 
     Attributes:
         name: of the stage; part of the seeds' paths.
         steps: how many.
-        weights: of what is compared.
-        rates: Adam's rate of what is learnt.
+        weights: of the maps in the loss.
+        rates: Adam's rates of the learnt parameters.
         final_rates: rates at the last step, reached log-linearly; the others stay.
         sh_degree: highest degree of the harmonics.
         sh_every: steps after which one more degree is learnt.
         background: behind the surfels.
-        density: makes and removes surfels; None leaves their number.
-        exposures: curve of the photos whose exposures are found; None takes them as exposed alike.
-        consistency: pulls normals to those that the views' depths agree on; None does not.
-        coarse: shares of the steps that see photos smaller by the powers of two down to 2, smallest first.
+        density: adds and removes surfels; None keeps their number.
+        exposures: tone curve of photos whose exposures are estimated; None: all have one exposure.
+        consistency: pulls normals to the fused normals of the views' depths; None: no pull.
+        coarse: shares of the steps on photos reduced by powers of two down to 2, smallest photos first.
         window: side in pixels of the square window of a view, at a random place, that a step compares; views
             that are no larger are compared whole. None: all are. Not with consistency, whose maps are whole.
     """
@@ -108,12 +108,12 @@ class Plan:
     window: int | None = None
 
     def smaller(self, step: int) -> int:
-        """How many times smaller than the photos are the pictures that step ``step`` (from 0) compares."""
+        """Reduction factor of the photos in step ``step`` (from 0)."""
         ends = [round(share * self.steps) for share in accumulate(self.coarse)]
         return 1 << sum(step < end for end in ends)
 
     def learning(self, names: Collection[str]) -> Plan:
-        """The same plan, learning these parameters alone."""
+        """The same plan, learning only these parameters."""
         kept = {name: rate for name, rate in self.rates.items() if name in names}
         final = {name: rate for name, rate in self.final_rates.items() if name in names}
         return replace(self, rates=kept, final_rates=final)
@@ -175,9 +175,9 @@ class Stage:
     """One stage under way.
 
     Args:
-        plan: what to do.
+        plan: its settings.
         views: training views.
-        surfels: what is learnt; changed in place.
+        surfels: the learnt surfels, changed in place.
         kernel_degree: of the surfels.
         seed: root of every random number.
 
@@ -208,7 +208,7 @@ class Stage:
         self._targets: LRUCache[View, dict[str, Tensor]] = LRUCache(kept, getsizeof=_n_bytes)
 
     def run(self, watch: Watch | None = None) -> None:
-        """Take the steps that are left.
+        """Take the remaining steps.
 
         Raises:
             TronError: a parameter or the loss is no longer finite; it names the step and the parameter.
@@ -263,7 +263,7 @@ class Stage:
         return min(self.step // self.plan.sh_every, self.plan.sh_degree)
 
     def pictured(self) -> Sequence[View]:
-        """The views as the next step sees them: in the size that the plan has for it."""
+        """The views at the plan's size for the next step."""
         times = self.plan.smaller(self.step)
         if times != self._reduced[0]:
             self._reduced = (times, [view.reduced(times) for view in self.views])
@@ -283,7 +283,7 @@ class Stage:
         return view if self.plan.window is None else self._window(view, self.plan.window, step)
 
     def _target(self, view: View) -> dict[str, Tensor]:
-        """Its maps, those of recent steps as they were."""
+        """The view's target maps, cached from recent steps."""
         found = self._targets.get(view)
         if found is None:
             found = targets(view, self.plan.weights.wanted(), self.surfels.device)
@@ -364,7 +364,7 @@ class DensityControl:
         self.total = self.seen = torch.zeros(0)
 
     def observe(self, surfels: LearntSurfels, camera: Tensor) -> None:
-        """Take note of the gradients of one step, seen from ``camera``, (3,), world."""
+        """Accumulate the gradients of one step seen from ``camera``, (3,), world."""
         if len(self.total) != len(surfels):
             self.forget(surfels)
         means = surfels["means"]
@@ -375,14 +375,14 @@ class DensityControl:
         self.seen += pull > 0
 
     def forget(self, surfels: LearntSurfels) -> None:
-        """Begin a new mean."""
+        """Reset the running mean."""
         self.total = torch.zeros(len(surfels), device=surfels.device)
         self.seen = torch.zeros(len(surfels), device=surfels.device)
 
     def after(self, surfels: LearntSurfels, step: int, smaller: int = 1) -> None:
         """Add, remove and reset surfels as is due once ``step`` (from 1) is done.
 
-        Pictures that are ``smaller`` than the photos by a factor have room for so many times fewer surfels.
+        Photos reduced by the factor ``smaller`` allow that many times fewer surfels.
         """
         s = self.settings
         if s.start < step < s.end and step % s.every == 0:

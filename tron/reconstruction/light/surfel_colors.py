@@ -34,12 +34,12 @@ _STEP = 2.0  # spacings along the normal that the surface may lie farther or nea
 
 @dataclass(frozen=True)
 class SurfelColors:
-    """Colours that photos agree on.
+    """Surfel colours that the photos agree on.
 
     Attributes:
-        color: (M, 3) float32 linear light of each surfel, of the mean photo's exposure: a median over its
-            photos; 0 where none shows it.
-        spread: (M,) float32, median absolute difference of the logarithms to that.
+        color: (M, 3) float32 linear colour of each surfel at the mean photo's exposure: a median over its
+            photos; 0 if none shows it.
+        spread: (M,) float32, median absolute difference of the logarithms from that median.
         count: (M,) int32, photos that show it.
         gain: (V, 3) float32, exposure and white balance of the photos; their mean logarithm is 0.
     """
@@ -55,11 +55,10 @@ class SurfelColors:
         return self.count > 0
 
     def mirroring(self, means: np.ndarray) -> float:
-        """Share of the surfels at ``means`` (M, 3) that photos show where colours change with the view.
+        """Share of the seen surfels at ``means`` (M, 3) whose neighbourhood changes colour with the view.
 
-        As those of mirrors, glass, polished metal and black gloss do, of which neither shape nor materials
-        can be found: path-traced balls of these under three maps have 0.2 to 0.75, matt ones and gloss over
-        paint 0.
+        Mirrors, glass, polished metal and black gloss do; neither their shape nor their materials can be
+        found. Path-traced balls of these under three maps have 0.2 to 0.75, matt ones and gloss over paint 0.
         """
         seen = np.flatnonzero(self.seen)
         if not len(seen):

@@ -1,19 +1,19 @@
-"""Materials of each surfel by evidence over views, in a light that is known.
+"""Material of each surfel from its colours over many views, in known light.
 
-For a roughness r and a metallic m of 0 or 1, what leaves a surfel towards a camera grows with its base color
+For a roughness r and a metallic m of 0 or 1, a surfel's radiance towards a camera grows with its base color
 b (:mod:`tron.shading.composition`, with E + I received, o S + I mirrored by the lobe of r):
 
     m = 0    c = b (1 - k) (E + I) + k (o S + I)        k = G g(F_glass), of :mod:`tron.brdf.reflectance`
     m = 1    c = (b A + B) g(F_b) (o S + I)
 
-so each photo of the surfel gives a b for each (r, m); their median is the base color if that were its
-material, and how well it explains all photos says whether it is. A highlight that moves with the camera is
-explained by a lobe of its width and by no other; a surfel that shows none is explained by all alike, and
-then its neighbours of like colour decide: losses are summed over them. Where they know nothing either, the
-material is what ``prior_roughness`` says, dielectric.
+so each photo of the surfel gives a b for each candidate (r, m). The median of these is the candidate's base
+color, and the candidate that explains all photos best is chosen. A highlight that moves with the camera is
+explained only by a lobe of its width. A surfel without highlight is explained by all candidates equally;
+then its neighbours of similar colour decide, because losses are summed over them. If these do not decide
+either, the material is a dielectric of ``prior_roughness``.
 
-Dark gloss shows what a dark mirror shows, but no metal is dark: iron, among the darkest, reflects 0.56. So
-a metal must be bright, in the unit in which mean irradiance over what is seen is 1.
+A dark glossy dielectric looks like a dark mirror, but no metal is dark: iron, among the darkest, reflects
+0.56. So a metal must be bright, in the unit in which mean irradiance over the seen surfels is 1.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ from tron.runtime import aligned, lanes
 from tron.shading.lighting import Lighting
 
 ROUGHNESSES = np.array([0.15, 0.25, 0.35, 0.5, 0.7, 0.95])
-"""Widths of lobes that are tried."""
+"""Candidate roughnesses."""
 _ROBUST = 0.1  # log difference beyond which an observation is doubted
 _DARK = 0.1  # share of the mean colour that is added before logarithms: the dark is noise
 _LIKE = 24  # neighbours that decide together
@@ -45,8 +45,8 @@ _CERTAIN = 0.02  # mean loss by which a material must be better to be e times as
 _PRIOR = 0.02  # loss of a roughness at 1 from the prior's
 _METAL_LOSS = 0.06  # loss of a polished metal: few things are one
 _ROUGH_METAL_LOSS = 5.0
-"""Loss of a metal of roughness 1, over a polished one's: it looks like paint, and in a light that is somewhat
-wrong fur looks like it."""
+"""Additional loss of a metal of roughness 1 over a polished one: it looks like paint, and in slightly wrong
+light fur looks like it."""
 _METAL_LUMINANCE = 0.2  # a stop and a half below iron: cameras do not expose exactly
 _HALVINGS = 12
 _METAL_COLOR = 0.7
@@ -59,10 +59,10 @@ class Received:
     """Light at M surfels, linear, / pi, in the unit of the observations.
 
     Attributes:
-        direct: (M, 3) irradiance that arrives of the environment.
-        unshadowed: (M, 3) the same with nothing in the way.
+        direct: (M, 3) shadowed irradiance of the environment.
+        unshadowed: (M, 3) unshadowed irradiance of the environment.
         bounced: (M, 3) irradiance of bounced light.
-        openness: (M,) share of directions in which nothing is met.
+        openness: (M,) share of directions in which no surfel is met.
     """
 
     direct: np.ndarray
@@ -72,11 +72,11 @@ class Received:
 
     @property
     def total(self) -> np.ndarray:
-        """(M, 3) all that arrives."""
+        """(M, 3) direct and bounced irradiance."""
         return self.direct + self.bounced
 
     def balanced(self, balance: np.ndarray) -> Received:
-        """The same of an environment that is divided by ``balance`` (3,); what bounced stays."""
+        """The light of an environment divided by ``balance`` (3,); bounced light is unchanged."""
         return replace(self, direct=self.direct / balance, unshadowed=self.unshadowed / balance)
 
 
@@ -87,7 +87,7 @@ class Materials:
     Attributes:
         base_color: (M, 3) float32, linear, not limited to 1.
         roughness, metallic: (M,) float32 in [0, 1].
-        confidence: (M,) float32 in [0, 1]: how much of the choice of roughness and metallic the photos made.
+        confidence: (M,) float32 in [0, 1]: how far the photos, not priors, decided roughness and metallic.
     """
 
     base_color: np.ndarray
@@ -104,15 +104,15 @@ def materials_of(
     received: Received,
     prior_roughness: float,
 ) -> Materials:
-    """Choose each surfel's material; of surfels that no photo shows, by their neighbours.
+    """Choose each surfel's material; surfels without photo follow their neighbours.
 
     Args:
         scene: geometry.
         found: observations of its surfels.
-        colors: of the same.
-        lighting: the light, in their unit.
-        received: what it gives the surfels.
-        prior_roughness: where nothing is known.
+        colors: mean colours of its surfels.
+        lighting: the light, in the observations' unit.
+        received: its light at the surfels.
+        prior_roughness: roughness if photos decide nothing.
     """
     color = found.color / colors.gain[found.view]
     dark = _DARK * float(color.mean())
@@ -165,13 +165,13 @@ def choose(
         colors: of its surfels.
         bases: (K, M, 3) base color of each candidate.
         losses: (K, M) loss of each, summed over the surfel's photos.
-        prior_roughness: where nothing is known.
-        white: (3,) mean irradiance / pi over what is seen.
+        prior_roughness: roughness if photos decide nothing.
+        white: (3,) mean irradiance / pi over the seen surfels.
     """
     seen = np.flatnonzero(colors.seen)
     log = np.log(np.maximum(colors.color, FLOOR))
     place = np.concatenate([scene.means / scene.spacing, log / _CHROMA], 1)
-    # Surfels that no photo shows have no colour: place alone says who is near.
+    # Surfels without photo have no colour: only place determines their neighbours.
     like = _nearest(place[seen], place)
     blind = np.flatnonzero(~colors.seen)
     if len(blind):
@@ -192,7 +192,7 @@ def choose(
     own = np.exp(-(prior - prior.min()) / _CERTAIN)
     own /= own.sum()
     told = 0.5 * np.abs(weight - own[:, None]).sum(0)
-    # Base color is a surfel's own; where it has none it is its neighbours'.
+    # Base color is the surfel's own; without photo, its neighbours'.
     base = np.einsum("km,kmc->mc", weight, bases)
     if len(blind):
         base[blind] = base[like[blind]].mean(1)
@@ -205,7 +205,7 @@ def choose(
 
 
 def _metal(base: np.ndarray, scale: np.ndarray, bias: np.ndarray, whole: np.ndarray) -> np.ndarray:
-    """Albedo of metal, whose base color is held below 1 where it is compensated for."""
+    """Albedo of metal, with base color clamped below 1 for the compensation."""
     fresnel = mean_fresnel(np.clip(base, 0, 1))
     return (base * scale + bias) * compensation(fresnel, scale + bias, whole)
 

@@ -1,19 +1,18 @@
-"""Materials of learnt surfels, a scan's or of photos, however many layers they lie in.
+"""Materials of learnt surfels, of a scan or of photos, in any number of layers.
 
-Surfels that were learnt from pictures are fog to light: their normals and shadows mean little. So light and
-materials are found on their proxy (:mod:`tron.relighting.proxy`), one layer, from the photos, or from the
-film that it was made of, by the joint fit (:mod:`tron.reconstruction.materials.joint_fit`). What the fit says
-of shading is then taken out of each surfel's own colour, which keeps all of its detail. Of proxy surfel p and
-the surfels i that are nearest to it
+Light treats learnt surfels as fog: their normals and shadows mean little. So light and materials are fitted
+on their one-layer proxy (:mod:`tron.relighting.proxy`), from the photos or from a film of the scan, by the
+joint fit (:mod:`tron.reconstruction.materials.joint_fit`). The fitted shading is then divided out of each
+surfel's own colour, which keeps all of its detail. For proxy surfel p and the surfels i nearest to it
 
-    shade_p = shown_p / max(base_p, 0.01), a geometric mean over neighbours that look the same way
+    shade_p = shown_p / max(base_p, 0.01), a geometric mean over neighbours with similar normals
     base_i  = own_i / shade_p, within base_p / 8 and 8 base_p
     roughness_i, metallic_i = those of p
 
-Films do not tell bright paint in dim light from dim paint in bright light, nor the colour of either. A camera
-does: it balances white and exposes for what it sees. So mean irradiance over what is seen is held grey and as
-bright as its meter says (:func:`tron.reconstruction.materials.joint_fit.metered_light`), before base color is
-limited. That "the brightest surfaces are at 0.8" is false of a man in black leather.
+Pictures alone do not tell bright paint in dim light from dark paint in bright light, nor coloured paint from
+coloured light. A camera's white balance and exposure do. So mean irradiance over the seen surfels is held
+grey and at the metered brightness (:func:`tron.reconstruction.materials.joint_fit.metered_light`), before
+base color is clamped. Assuming "the brightest surfaces are at 0.8" fails for a man in black leather.
 """
 
 from __future__ import annotations
@@ -42,16 +41,16 @@ from tron.tracing import SurfelTracer
 log = logging.getLogger(__name__)
 
 _SCALE = 1.0
-"""Weight of how bright base color is, over the photos' 0.05, with which it ran to 1.36 and was clipped."""
+"""Weight of base color's brightness prior; photos use 0.05, at which it reached 1.36 and was clipped."""
 _GREY = 0.5
-"""Weight of grey light, over the photos' 0.05, with which a golden guitar came out green in a red light."""
+"""Weight of the prior for grey light; photos use 0.05, at which a golden guitar turned green in red light."""
 _DARKEST = 0.01
 _SHADED, _ALIKE, _MOST = 1.0, 0.8, 100
 """Deviation in spacings of the Gaussian that shade is averaged by, least cosine, and how many surfels at
 most: 0.0 to 0.16 dB of relit pictures on four development captures, photographs of seeds 4242, 90210 and
 77041."""
 _APART = 8.0
-"""Largest factor between base colors of a surfel and of its proxy's."""
+"""Largest factor between the base colors of a surfel and of its proxy surfel."""
 _COMPARED, _RAYS, _SOLID = 6, 8, 0.99
 
 
@@ -61,9 +60,9 @@ class Carried:
 
     Attributes:
         scene: every surfel of the scan with its own radiance, and with materials.
-        proxy: what light sees of it, with the materials of the fit.
+        proxy: its one-layer proxy for light, with the materials of the fit.
         fit: of the proxy.
-        explained: dB between the scan's own look and its picture under the light that was found.
+        explained: PSNR in dB of the scan rendered under the found light against its own look.
     """
 
     scene: GaussianScene
@@ -79,11 +78,11 @@ class Carried:
 def carry_materials(
     capture: Capture, settings: JointSettings, seed: int, track: Track = untracked
 ) -> Carried | None:
-    """Find materials of a scan and the light it was captured in; None where it shows no surface, with a line.
+    """Find a scan's materials and the light of its capture; None, with a log line, if it shows no surface.
 
     Args:
-        capture: film of its ``scan``, whose display values the scan's harmonics are.
-        settings: of the joint fit. A film is exposed alike, and balanced: what they say of that is not asked.
+        capture: film of its ``scan``; the scan's harmonics are display values.
+        settings: of the joint fit. Its exposure and balance settings are ignored: a film has one exposure.
         seed: root of the random numbers.
         track: wraps long loops.
 
@@ -107,13 +106,13 @@ def carry_materials(
 def by_proxy(
     capture: Capture, scene: GaussianScene, settings: JointSettings, seed: int, track: Track = untracked
 ) -> tuple[GaussianScene, Proxy, JointFit] | None:
-    """Learnt surfels with the materials, and the proxy, that a joint fit on their proxy finds.
+    """Fit light and materials on the proxy of learnt surfels, and carry the materials to the surfels.
 
-    None where the capture's views agree on no surface, or show too few surfels of it.
+    None if the capture's views agree on no surface, or show too few of its surfels.
 
     Args:
-        capture: its training views are fitted to.
-        scene: surfels that were learnt from them, or that they film; mean colours are their display values.
+        capture: its training views are fitted.
+        scene: surfels learnt from the views, or filmed by them; their mean colours are display values.
         settings: of the joint fit.
         seed: root of the random numbers.
         track: wraps long loops.
@@ -135,12 +134,12 @@ def by_proxy(
 
 
 def carry(scan: GaussianScene, fit: JointFit, curve: ToneCurve) -> GaussianScene:
-    """A scan, or what was learnt from photos, with the materials of a fit of its proxy: see the module.
+    """Carry the materials of a proxy's fit to a scan or to surfels learnt from photos (module docstring).
 
     Args:
         scan: its mean colours are display values.
         fit: of the proxy's surfels.
-        curve: that these display values went through.
+        curve: tone curve of these display values.
     """
     proxy = fit.scene
     near = np.asarray(KDTree(proxy.means).query(scan.means)[1])
@@ -164,7 +163,7 @@ def _explained(
 ) -> float:
     """Mean PSNR, display values, of some views under the found light against the film, where it is opaque.
 
-    Of held-out views where there are any.
+    Held-out views are used if there are any.
     """
     light = Relighter(scene, Estimation(rays=_RAYS, filtered=True), seed, proxy=proxy).under(fit.environment)
     views, found = capture.test_views or capture.train_views, []

@@ -1,4 +1,4 @@
-"""Light and materials of a capture together, from its photos and the reconstructed geometry."""
+"""Joint fit of a capture's light and materials, from its photos and the reconstructed geometry."""
 
 from __future__ import annotations
 
@@ -91,12 +91,12 @@ class JointFit:
     Attributes:
         scene: the surfels with materials.
         environment: the light, in the unit of the photos over the capture's exposure.
-        sun: its part that is a lobe; None where no shadows tell of one.
-        colors: what the photos agree on.
-        shown: (M, 3) linear light that leaves the surfels; where no photo shows one, its neighbours'.
-        balance: (3,) factor by which the light was too bright when it was found (:func:`light_balance`), so
-            that ``environment`` and ``sun`` are divided by it; ones where that was not asked.
-        mirroring: share of what is seen that changes with the view, :meth:`SurfelColors.mirroring`.
+        sun: the lobe within it; None if no shadows show a sun.
+        colors: the surfel colours that the photos agree on.
+        shown: (M, 3) linear radiance of the surfels; of a surfel without photo, its neighbours'.
+        balance: (3,) factor by which the found light was too bright (:func:`light_balance`); ``environment``
+            and ``sun`` are already divided by it. Ones if it was not computed.
+        mirroring: share of the seen surfels that change with the view, :meth:`SurfelColors.mirroring`.
     """
 
     scene: GaussianScene
@@ -134,8 +134,8 @@ def fit_jointly(
     """Find light and materials on frozen surfels.
 
     Args:
-        capture: its training views are looked at.
-        scene: geometry; its materials are not looked at.
+        capture: its training views are used.
+        scene: geometry; its materials are ignored.
         prior: settings.
         seed: root of the random numbers.
         track: wraps long loops.
@@ -179,7 +179,7 @@ def fit_jointly(
         environment, received = EnvironmentMap(environment.image / balance), received.balanced(balance)
         sun = None if sun is None else replace(sun, strength=sun.strength / balance)
         materials = materials_of(scene, found, colors, Lighting(environment), received, prior.roughness)
-        # What is left without highlights and metals tells of the light better.
+        # Colours without highlights and metals determine the light better.
         diffuse = materials.base_color * received.total
         metallic = materials.metallic
     environment = EnvironmentMap(environment.image / np.float32(capture.exposure))
@@ -189,18 +189,18 @@ def fit_jointly(
 def light_balance(received: Received, colors: SurfelColors) -> np.ndarray:
     """(3,) factor by which a found light is too bright for a camera that balances white and meters.
 
-    Photos show what bounces, I, in their own unit, whatever light was found. So only what comes straight from
-    the light, E, is scaled, until both together are what the meter says, W (:func:`metered_light`), in the
-    mean over what is seen:
+    Photos give the bounced light I in their own unit, independently of the found light. So only the direct
+    light E is scaled, until the sum is the metered light W (:func:`metered_light`), in the mean over all
+    seen surfels:
 
         E / b + I = W      so      b = E / (W - I)
 
-    In a closed place of albedo a, I is a (E + I). None is above 0.8, so I counts up to 0.8 W: where photos
-    show more, as in a red room its red, the light keeps a fifth.
+    In a closed room of albedo a, I = a (E + I). Albedo is below 0.8, so I is limited to 0.8 W: if photos show
+    more, such as red in a red room, direct light keeps a fifth of W.
 
     Args:
-        received: what the found light gives the surfels.
-        colors: what photos show of them.
+        received: light at the surfels from the found light.
+        colors: the surfels' colours in the photos.
     """
     direct, bounced = (each[colors.seen].mean(0) for each in (received.direct, received.bounced))
     wanted = metered_light(float(luminance(colors.color[colors.seen].mean(0))))
@@ -216,12 +216,12 @@ def light_balance(received: Received, colors: SurfelColors) -> np.ndarray:
 def metered_light(shown: float) -> float:
     """Mean irradiance / pi over a subject, in the unit of its photos, by the camera that exposed them.
 
-    A meter sets what comes back from all that the camera sees to middle grey. Of that a subject of albedo a
-    is the share f, the rest is as bright as things are, b, in the same light:
+    A meter sets the mean radiance in the camera's view to middle grey. A subject of albedo a fills the share
+    f of the view; the rest has an average albedo b and the same light:
 
         E (f a + (1 - f) b) = 0.18,   shown = E a      so      E = (0.18 - f shown) / ((1 - f) b)
 
-    0.72 for a subject as bright as all else; 1 for one in black leather.
+    0.72 for a subject as bright as its surroundings; 1 for one in black leather.
 
     Args:
         shown: mean linear light that the photos show of the subject; 1 is their white.
@@ -231,14 +231,14 @@ def metered_light(shown: float) -> float:
 
 
 class LightFinder:
-    """Light from the colours of some of the surfels that photos show, whose rays are traced once.
+    """Finds light from the colours of some surfels seen in photos, whose rays are traced once.
 
     Args:
         tracer: the surfels.
-        colors: what photos show of them.
-        bounced: (M, 3) irradiance / pi that bounced.
-        sky: what photos show of it.
-        prior, seed: as of :func:`fit_jointly`.
+        colors: their colours in the photos.
+        bounced: (M, 3) irradiance / pi of bounced light.
+        sky: the sky in the photos.
+        prior, seed: as in :func:`fit_jointly`.
     """
 
     def __init__(
@@ -265,8 +265,8 @@ class LightFinder:
         """The light, and the sun in it, if shadows tell of one.
 
         Args:
-            diffuse: (M, 3) light that surfels send out in all directions alike.
-            metallic: (M,), those above a half do not count.
+            diffuse: (M, 3) diffuse radiance of the surfels.
+            metallic: (M,); surfels above a half do not count.
         """
         settings, seed = self.prior.light, self.seed
         kept = metallic[self.chosen] < _METAL
@@ -306,7 +306,7 @@ def receive(transport: BounceTransport, lighting: Lighting, bounced: np.ndarray,
 
 
 def photographed_bounces(transport: BounceTransport, shown: np.ndarray) -> np.ndarray:
-    """(M, 3) irradiance / pi of bounced light at surfels that send out what photos show of them (M, 3)."""
+    """(M, 3) irradiance / pi of bounced light at surfels whose radiance (M, 3) is given by photos."""
     code = np.array(transport.rays.met).reshape(-1, len(shown))
     sent = np.concatenate([shown, np.zeros((1, 3), shown.dtype)])
     total = np.zeros_like(shown)
@@ -319,7 +319,7 @@ def photographed_bounces(transport: BounceTransport, shown: np.ndarray) -> np.nd
 
 
 def _everywhere(colors: SurfelColors, scene: GaussianScene) -> np.ndarray:
-    """(M, 3) colours of all surfels: where no photo shows one, the mean of the nearest that one does."""
+    """(M, 3) colours of all surfels; a surfel without photo gets the mean of its nearest seen surfels."""
     seen = np.flatnonzero(colors.seen)
     near = np.reshape(KDTree(scene.means[seen]).query(scene.means, k=min(4, len(seen)))[1], (len(scene), -1))
     guessed = colors.color[seen[near]].mean(1)
@@ -346,7 +346,7 @@ def environment_of(light: Light, sun: Sun | None) -> EnvironmentMap:
 
 
 def _lobe_image(sun: Sun) -> np.ndarray:
-    """(H, 2 H, 3) float32 of the lobe alone, with its irradiance whatever the map rounds off."""
+    """(H, 2 H, 3) float32 map of the lobe alone, scaled to its irradiance at any resolution."""
     height = MAP_HEIGHT
     polar = np.arange(height)[:, None] * np.pi / (height - 1)
     around = (np.arange(2 * height) + 0.5)[None] * np.pi / height

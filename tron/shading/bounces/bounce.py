@@ -1,20 +1,20 @@
-"""Light that bounces: from every surfel some rays, traced once a scene; bounces of a light are gathers.
+"""Bounced light: rays from every surfel are traced once per scene; the bounces of each light are gathers.
 
-What a surfel's cosine-distributed rays meet does not depend on light, so it is found once and kept
-(:class:`BounceTransport`): one word a ray. With E the irradiance / pi of direct light, a the albedo of each
-surfel, its specular lobe included, and L what it emits, k bounces are the sum
+The hits of a surfel's cosine-distributed rays do not depend on light, so they are traced once and kept
+(:class:`BounceTransport`), one word per ray. With E the irradiance / pi of direct light, a the albedo of each
+surfel, its specular lobe included, and L its emission, k bounces are the sum
 
     I_0 = 0,    I_{k+1}(i) = 1/n sum_r (a (E + I_k) + L) (met_r(i))
 
-over the n rays of face i that meet one: I is the irradiance / pi of indirect light, a (E + I) + L what a face
-sends out, the same in all directions; L is that of fronts alone. Without bounces what glows lights nothing.
-Few rays of a surfel meet a lamp, so where something glows, I is averaged among neighbours in the end. Faces
-are the M fronts and the backs that rays meet: undersides that no camera saw, with light of their own. Rays
-are stopped as in
+over the n rays of face i that meet one: I is the irradiance / pi of indirect light, and a (E + I) + L the
+radiance of a face, the same in all directions; only fronts emit L. Without bounces, emission lights nothing.
+Few rays of a surfel meet a lamp, so if anything glows, I is finally averaged among neighbours. Faces are the
+M fronts and the backs that rays meet: undersides that no camera saw, with light of their own. Rays are
+stopped as in
 :mod:`tron.tracing.hierarchy.first_hit`, so each estimates the composited radiance without bias.
 
-Memory: 4 bytes a ray are kept, 128 MB of a million surfels with 32 rays each. While rays are traced,
-a million surfels at a time take another 250 bytes each: 380 MB in all, measured.
+Memory: 4 bytes per ray are kept, 128 MB for a million surfels with 32 rays each. While rays are traced, a
+million surfels at a time take another 250 bytes each: 380 MB in all, measured.
 """
 
 from __future__ import annotations
@@ -42,15 +42,15 @@ from tron.tracing.tracer import SurfelTracer
 
 RAYS = 32
 DIRECT = Estimation(rays=8)
-"""Direct light at a surfel: more than 8 rays gain nothing, 32 are worth 0.02 dB."""
+"""Estimation of direct light at a surfel: more than 8 rays gain little, 32 rays 0.02 dB."""
 SHOWN_RAYS = 32
-"""Shadow rays of a surfel for frames that trace none; of 8 they are 0.4 dB worse."""
+"""Shadow rays per surfel for frames that trace none; with 8, frames are 0.4 dB worse."""
 QUICK_RAYS = 8
-"""The same while a light is being turned; direct light is that of these rays too."""
+"""Shadow rays per surfel while a light is being turned; they give the direct light too."""
 BOUNCED_VALUES = 4
-"""Values of a bake at a surfel that every frame has: indirect light and openness."""
+"""Number of baked values per surfel in every frame: indirect light and openness."""
 FEWEST = 2
-"""Rays that meet the back of a surfel which counts."""
+"""Least number of rays that must meet a surfel's back for it to count."""
 
 
 @dataclass
@@ -59,16 +59,16 @@ class BouncedLight:
 
     Attributes:
         direct: mi.Color3f, irradiance / pi of the environment, shadows included.
-        indirect: mi.Color3f, irradiance / pi of light that has met surfels, or comes from those that glow.
-        outgoing: mi.Color3f, radiance that the surfel's front sends out, taken as the same in all directions.
-        behind: mi.Color3f, radiance that its back sends out, likewise: by light of its own where rays of
-            surfels meet it, else by the indirect light of its front.
+        indirect: mi.Color3f, irradiance / pi of light reflected or emitted by surfels.
+        outgoing: mi.Color3f, radiance of the surfel's front, taken as the same in all directions.
+        behind: mi.Color3f, radiance of its back, taken as the same in all directions: from the back's own
+            light if rays of surfels meet it, else from the indirect light of its front.
         openness: mi.Float in [0, 1], share of the surfel's rays that meet nothing.
-        reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, lent
-            among neighbours (:mod:`tron.shading.bounces.lending`); None where that is not known.
+        reaching: gives the share of the unshadowed irradiance that reaches the surfel, by channel, averaged
+            among neighbours (:mod:`tron.shading.bounces.lending`); None if it is not known.
         faces: direct light of all faces, fronts first (:meth:`BounceTransport.direct_of_faces`).
-        emitted: mi.Color3f, radiance that the surfel's front emits, of which ``outgoing`` has it already;
-            None where nothing glows.
+        emitted: mi.Color3f, radiance emitted by the surfel's front, already included in ``outgoing``;
+            None if nothing glows.
     """
 
     direct: mi.Color3f
@@ -81,9 +81,9 @@ class BouncedLight:
     emitted: mi.Color3f | None = None
 
     def values(self, rays: int = FINAL.rays) -> list[mi.Float]:
-        """What ``SurfelTracer.gbuffer`` composites, for frames of ``rays`` shadow rays a pixel.
+        """The values to composite by ``SurfelTracer.gbuffer``, for frames of ``rays`` shadow rays per pixel.
 
-        Indirect light and openness, four numbers a surfel; for frames without rays what reaches, three more.
+        Indirect light and openness, four numbers per surfel; without rays also ``reaching``, three more.
         """
         reaching = [] if rays or self.reaching is None else self.reaching()
         return [*self.indirect, self.openness, *reaching]
@@ -93,8 +93,8 @@ class BounceTransport:
     """Hits of the cosine-distributed rays of each of M surfels; made by :meth:`trace`.
 
     Attributes:
-        rays: those rays, and what stops each of them.
-        undersides: the B backs that they meet; None where they meet none, or where backs are dark.
+        rays: the rays and their hits.
+        undersides: the B backs that they meet; None if they meet none, or if backs are dark.
     """
 
     def __init__(self, rays: SurfelRays, undersides: Undersides | None = None) -> None:
@@ -115,8 +115,8 @@ class BounceTransport:
     ) -> BounceTransport:
         """Trace ``rays`` rays of each surfel: 0.2 seconds for 20,000 surfels of 32 rays on one core.
 
-        The more rays the less noise; powers of two from 8 on are stratified and traced in fans. ``track``
-        wraps the loop over a part's fans of rays, to show progress.
+        More rays give less noise; powers of two from 8 on are stratified and traced in fans. ``track`` wraps
+        the loop over a part's fans of rays, to show progress.
 
         Raises:
             TronError: no rays, or more than 32-bit indices address.
@@ -130,10 +130,10 @@ class BounceTransport:
         return cls(traced, Undersides.of(traced))
 
     def moved(self, tracer: SurfelTracer) -> BounceTransport:
-        """The same rays among surfels that have moved: of ``tracer``, which is ``self.tracer.moved(..)``.
+        """The same rays among moved surfels; ``tracer`` is ``self.tracer.moved(..)``.
 
-        Only what has changed is traced again (:mod:`tron.shading.bounces.bounce_rays`): of 20,000 surfels, 4
-        % moved, in half the time; of 200,000, 2 % moved, in a tenth.
+        Only changed rays are traced again (:mod:`tron.shading.bounces.bounce_rays`): with 4 % of 20,000
+        surfels moved, in half the time of all rays; with 2 % of 200,000, in a tenth.
 
         Raises:
             TronError: another number of surfels.
@@ -143,7 +143,7 @@ class BounceTransport:
         rays = self.rays.after(tracer)
         if rays.met is not self.rays.met:
             return BounceTransport(rays, Undersides.of(rays))
-        other = BounceTransport(rays, self.undersides)  # materials alone
+        other = BounceTransport(rays, self.undersides)  # only materials are read
         if "_lending" in self.__dict__:
             other.__dict__["_lending"] = self._lending
         return other
@@ -253,14 +253,14 @@ class BounceTransport:
         bounces: int | None = None,
         seed: int = 0,
     ) -> BouncedLight:
-        """The light of ``lighting`` at each surfel.
+        """Bake the light of ``lighting`` at each surfel.
 
         Args:
             lighting: the prepared environment.
-            estimation: of the frames; the surfels have their estimator, sides, material and bounces, but
-                shadow rays of their own (``DIRECT``).
+            estimation: of the frames; its estimator, sides, material and bounces are used, but the surfels
+                have their own number of shadow rays (``DIRECT``).
             bounces: None: those of ``estimation``.
-            seed: as of :meth:`direct`.
+            seed: as in :meth:`direct`.
         """
         direct = self.direct_of_faces(lighting, at_surfels(estimation), seed)
         baked = self.bounced(direct, estimation, bounces)
@@ -285,15 +285,15 @@ class BounceTransport:
         return replace(self.bounced(self._of_faces(direct), estimation), reaching=lambda: reaching)
 
     def rebaked(self, baked: BouncedLight, estimation: Estimation = FINAL) -> BouncedLight:
-        """The light of a bake of the same surfels, whose materials alone were others: no ray is traced."""
+        """Update a bake of the same surfels with other materials: no ray is traced."""
         return replace(self.bounced(baked.faces, estimation), reaching=baked.reaching)
 
     def reaching(
         self, lighting: Lighting, estimation: Estimation, seed: int = 0, *, lent: bool
     ) -> list[mi.Float]:
-        """(M,) the three numbers that :class:`BouncedLight` calls so, of a surfel's own rays or lent.
+        """(M,) ``reaching`` of :class:`BouncedLight`, from a surfel's own rays or averaged with neighbours.
 
-        Arguments as of :meth:`visible`.
+        Arguments as in :meth:`visible`.
         """
 
         def of(part: Part) -> list[mi.Float]:
@@ -315,7 +315,7 @@ class BounceTransport:
         albedo = self._of_faces(self.albedo(estimation.brdf))
         indirect = self._indirect(direct, albedo, bounces)
         emitted = self.tracer.emission
-        if emitted is not None:  # few rays of a surfel meet what glows: of 32 a tenth
+        if emitted is not None:  # few rays of a surfel meet a glowing one: of 32 a tenth
             indirect[0] = mi.Color3f(*self._lending.lent([*indirect[0]]))
         outgoing = _sent(albedo, direct, indirect, emitted)
         behind = albedo[0] * indirect[0]
@@ -331,12 +331,12 @@ class BounceTransport:
 
 
 def at_surfels(estimation: Estimation) -> Estimation:
-    """Of direct light at surfels, where frames are estimated by ``estimation``."""
+    """Estimation of direct light at surfels, for frames with ``estimation``."""
     return estimation.model_copy(update={"rays": DIRECT.rays, "filtered": DIRECT.filtered})
 
 
 def _visible_behind(behind: Undersides, lighting: Lighting, estimation: Estimation, seed: int) -> mi.Color3f:
-    """(B,) as :meth:`BounceTransport.visible`, of undersides."""
+    """(B,) :meth:`BounceTransport.visible` for undersides."""
 
     def of(part: Part) -> mi.Color3f:
         root = integer(seed, "bounce", "direct", "undersides", part.first)
@@ -361,7 +361,7 @@ def _sent(
     indirect: Sequence[mi.Color3f],
     emitted: mi.Color3f | None,
 ) -> list[mi.Color3f]:
-    """Radiance that all faces send out, fronts first, which alone emit."""
+    """Radiance of all faces, fronts first; only fronts emit."""
     front, *backs = [a * (e + i) for a, e, i in zip(albedo, direct, indirect, strict=True)]
     return [front if emitted is None else front + emitted, *backs]
 
@@ -381,7 +381,7 @@ def _packed(colors: Sequence[mi.Color3f]) -> mi.Float:
 def _gathered(
     met: mi.UInt32, sent: mi.Float, place: mi.UInt32, fronts: mi.UInt32, over: mi.UInt32, rays: int
 ) -> mi.Color3f:
-    """Mean over the rays of faces of what they meet: ``sent`` packed, of all faces, by channel.
+    """Mean over each face's rays of the radiance they meet, by channel; ``sent``: of all faces, packed.
 
     Args:
         met: of those faces; ``over`` is 1 where its sides are exchanged, else 0.
@@ -412,11 +412,11 @@ def _openness(met: mi.UInt32, rays: int, count: int) -> mi.Float:
     return mi.Float(free) / mi.Float(end)
 
 
-# A back face stands for a side that is there. What reaches it is not what reaches its front: a sheet in the
-# sun is dark from below. So each surfel that rays meet from behind has a second face, from which rays go
-# out as if the scene were turned over. Backs that are met by one ray alone are left out: such rays have
-# slipped through the last hundredths of something closed. They are dark, as are backs that only other backs
-# meet: the inside.
+# A back face stands for a real side of a surface, and its light differs from the front's: a sheet in the sun
+# is dark from below. So each surfel that rays meet from behind gets a second face, whose rays are traced as
+# if the scene were turned over. Backs met by a single ray are left out and stay dark: such rays have slipped
+# through the last hundredths of transmittance of something closed. Backs that only other backs meet are
+# inside, and dark too.
 # Floors under a sheet of 1 x 1, 0.3 to 1.2 above them, have 0.95 to 1.08 of the light that path tracing gives
 # their shadow.
 
@@ -444,7 +444,7 @@ class Undersides:
         count = len(rays.tracer.scene)
         behind = (rays.met != NOTHING) & ((rays.met & 1) == 1) & ((rays.met & OWN) == 0)
         times = dr.zeros(mi.UInt32, count)
-        # Left to itself Dr.Jit makes copies for each thread, in a kernel for each number of surfels.
+        # By default Dr.Jit makes copies for each thread, in a kernel for each number of surfels.
         direct = dr.ReduceMode.Direct
         dr.scatter_reduce(dr.ReduceOp.Add, times, mi.UInt32(1), surfel_met(rays.met), behind, direct)
         order = rays.tracer.bvh.order

@@ -1,10 +1,10 @@
-"""Cosine-distributed rays of every surfel, and what stops each of them: the part of bounces without light.
+"""Cosine-distributed rays of every surfel and the hit of each: the part of bounces independent of light.
 
-A ray's direction and its chances depend on the seed, on its surfel and on nothing that moves, so rays can be
-traced again one by one. Of a scene in which some surfels have moved, few rays have changed: those of moved
-surfels, those that met one, and those that one has come in the way of. The last are found by all rays in a
-hierarchy of the moved surfels alone, where a stop counts if it is nearer than what was met before. Together
-that is what tracing all rays anew gives, to the byte.
+A ray's direction and random numbers depend only on the seed and its surfel, not on anything that moves, so
+rays can be traced again one by one. When some surfels have moved, few rays change: those of moved surfels,
+those that had met one, and those that a moved surfel now blocks. The last are found by tracing all rays in a
+hierarchy of the moved surfels alone, where a hit counts if it is nearer than the earlier one. The result is
+the same, to the byte, as tracing all rays anew.
 """
 
 from __future__ import annotations
@@ -31,23 +31,23 @@ from tron.tracing.tracer import SurfelTracer
 AT_ONCE = 1 << 20
 """Surfels whose rays are traced at a time, and single rays."""
 OWN = 1 << 31
-"""Mark of a stop that belongs to the sheet which the ray left."""
+"""Flag of a hit on the sheet that the ray left."""
 OWN_SPACINGS, OWN_COSINE = 1.25, 0.5
-"""Distance of a ray's origin from the plane of such a stop, in spacings of its surfel, and least cosine, by
-amount, between the normals. 1 and 0.7 let 1.0 % of a lamp through a sheet without a gap, 1 and 0.5 0.6 %."""
+"""Largest distance of a ray's origin from the plane of such a hit, in spacings of its surfel, and least
+absolute cosine between normals. 1 and 0.7 let 1.0 % of a lamp through a closed sheet, 1 and 0.5 let 0.6 %."""
 MANY = 0.2
-"""Share of surfels that have moved above which it is quicker to trace all rays anew."""
+"""Share of moved surfels above which it is faster to trace all rays anew."""
 _WIDTH = 1 << BLOCK_BITS
 
 
 @dataclass
 class Part:
-    """Surfels that are treated at once, as an image of their centres.
+    """Surfels processed together, as an image of their centres.
 
     Attributes:
         gbuffer: the image, 64 pixels across; opacity 0 where there is no surfel.
         surfel: mi.UInt32, of each lane.
-        first: pixels of the parts before.
+        first: number of pixels in earlier parts.
     """
 
     gbuffer: GBuffer
@@ -58,8 +58,8 @@ class Part:
 def parts(tracer: SurfelTracer, some: mi.UInt32 | None = None) -> Iterator[Part]:
     """All surfels, or ``some``, in the hierarchy's order along the Z curve of square blocks.
 
-    Pixels that are neighbours there are neighbours in space: they share the strata of one sequence, their
-    rays pass the same nodes, and they can lend each other their noise.
+    Neighbouring pixels are then neighbours in space: they share the strata of one sequence, their rays pass
+    the same nodes, and they can be filtered together.
     """
     order = tracer.bvh.order if some is None else some
     count = dr.width(order) if len(tracer.scene) else 0
@@ -94,11 +94,11 @@ class _Lanes:
 class SurfelRays:
     """``rays`` rays of each of the M surfels of ``tracer``, below ``seed``.
 
-    Where they begin and end follows the surfels, which may move: :meth:`after`.
+    Their origins and hits follow surfels that move: :meth:`after`.
 
     Attributes:
-        met: mi.UInt32 (rays x M), ray r of surfel i at r M + i: twice the surfel met, plus 1 where it is met
-            from the back, ``OWN`` added where that is the ray's own sheet; ``NOTHING``. :func:`surfel_met`.
+        met: mi.UInt32 (rays x M), ray r of surfel i at r M + i: twice the surfel met, plus 1 at its back,
+            plus ``OWN`` if it is the ray's own sheet; or ``NOTHING``. See :func:`surfel_met`.
     """
 
     def __init__(
@@ -112,7 +112,7 @@ class SurfelRays:
         self._count = dr.opaque(mi.UInt32, len(tracer.scene))
         self._points = PixelPoints.make(rays, 1, _WIDTH, seed, "bounce")
         self._root = dr.opaque(mi.UInt32, integer(seed, "bounce", "stops"))
-        # A surfel keeps its strata wherever it goes.
+        # A surfel keeps its strata when it moves.
         self._pixel = dr.zeros(mi.UInt32, len(tracer.scene))
         for part in parts(tracer):
             pixel = part.gbuffer.pixel + part.first
@@ -121,7 +121,7 @@ class SurfelRays:
         self.met = self._trace(track)
 
     def after(self, tracer: SurfelTracer) -> SurfelRays:
-        """The same rays, of the same surfels where ``tracer`` has them."""
+        """The same rays for the same surfels at their places in ``tracer``."""
         other = copy(self)
         other.tracer = tracer
         changed = _changed(self.tracer.records, tracer.records)
@@ -136,7 +136,7 @@ class SurfelRays:
         return other
 
     def of_some(self, tracer: SurfelTracer, surfel: mi.UInt32) -> mi.UInt32:
-        """Codes, as ``met``, of what stops the rays of some surfels (B,) in ``tracer``: (rays x B)."""
+        """Hits, coded as in ``met``, of the rays of some surfels (B,) in ``tracer``: (rays x B)."""
         other, some = copy(self), dr.opaque(mi.UInt32, dr.width(surfel))
         other.tracer = tracer
         met = dr.empty(mi.UInt32, self.rays * dr.width(surfel))
@@ -144,7 +144,7 @@ class SurfelRays:
             count = min(AT_ONCE, dr.width(surfel) - first)
             lane = dr.arange(mi.UInt32, count) + dr.opaque(mi.UInt32, first)
             there = dr.full(mi.Bool, True, count)
-            dr.eval(lane, there)  # else where they stand in the kernels depends on what was computed before
+            dr.eval(lane, there)  # else their order in the kernels depends on earlier computations
             for ray, directions, seeds, lanes in other._fans(dr.gather(mi.UInt32, surfel, lane), there):
                 hits = tracer.first_hits(
                     lanes.origin, directions, [there] * len(directions), seeds, lanes.normal
@@ -171,7 +171,7 @@ class SurfelRays:
     def _fans(
         self, surfel: mi.UInt32, active: mi.Bool, track: Callable[[range], Iterable[int]] = iter
     ) -> Iterator[tuple[mi.UInt32, list[mi.Vector3f], list[mi.UInt32], _Lanes]]:
-        """All rays of the surfels, a fan at a time: its first ray, directions, seeds, where it begins."""
+        """All rays of the surfels, one fan at a time: its first ray, directions, seeds and origins."""
         lanes = self._lanes(surfel, active)
         for first in track(range(0, self.rays, self._points.fan)):
             ray = dr.opaque(mi.UInt32, first)
@@ -194,7 +194,7 @@ class SurfelRays:
         return met
 
     def _meet(self, few: Bvh, changed: mi.Bool) -> None:
-        """Let the rays of unmoved surfels meet those that have moved, where they are nearer."""
+        """Replace hits of unmoved surfels' rays by nearer hits on moved surfels."""
         records, back_faces = self.tracer.records, self.tracer.back_faces
         for part in parts(self.tracer):
             still = (part.gbuffer.opacity > 0) & ~dr.gather(mi.Bool, changed, part.surfel)
@@ -214,7 +214,7 @@ class SurfelRays:
                 dr.eval(self.met)
 
     def _trace_again(self, before: mi.UInt32, changed: mi.Bool) -> None:
-        """Trace the rays of surfels that have moved and those that met one, one by one."""
+        """Trace again, one by one, the rays of moved surfels and the rays that had met one."""
         every = dr.arange(mi.UInt32, dr.width(before))
         # In the hierarchy's order, so that neighbours are traced together.
         surfel = dr.gather(mi.UInt32, self.tracer.bvh.order, every % self._count)
@@ -239,14 +239,14 @@ def surfel_met(code: mi.UInt32) -> mi.UInt32:
     return (code & (OWN - 1)) >> 1
 
 
-# Jitter puts surfels of a sheet's other layer, or of a ray's own, a little above its origin. Beyond what rays
-# forgive (:func:`tron.tracing.hierarchy.transmittance.blocks`) they stop it, and show what the other side of
-# the sheet gets: 4 % of a lamp behind two white layers without a gap. Such a stop is met from the sheet's
-# wrong side and lies in its plane. It is taken for the face that the ray has left.
+# Jitter puts some surfels of a sheet's other layer, or of a ray's own, slightly above its origin. Beyond the
+# tolerance of :func:`tron.tracing.hierarchy.transmittance.blocks` they stop the ray and show the light of
+# the sheet's other side: 4 % of a lamp behind two white layers without a gap. Such a hit is on the sheet's
+# wrong side and in its plane. It is treated as the face that the ray has left.
 
 
 def _code(tracer: SurfelTracer, hit: FirstHit, lanes: _Lanes) -> mi.UInt32:
-    """A hit of rays of ``lanes`` as it is kept: :attr:`SurfelRays.met`."""
+    """Encode hits of the rays of ``lanes`` as in :attr:`SurfelRays.met`."""
     met = hit.surfel != NOTHING
     there = centres(tracer.records, hit.surfel, met)
     radius = dr.gather(mi.Float, tracer.records.geometry, hit.surfel * (4 * GEOMETRY_PACKETS) + RADIUS, met)
@@ -259,7 +259,7 @@ def _code(tracer: SurfelTracer, hit: FirstHit, lanes: _Lanes) -> mi.UInt32:
 
 
 def _changed(before: SurfelRecords, now: SurfelRecords) -> mi.Bool:
-    """Surfels whose place, orientation, size or opacity is another."""
+    """Surfels whose place, orientation, size or opacity has changed."""
     surfel, same = dr.arange(mi.UInt32, now.count), mi.Bool(True)
     for packet in range(GEOMETRY_PACKETS):
         index = surfel * GEOMETRY_PACKETS + packet

@@ -1,7 +1,7 @@
-"""Surfels that lend each other what few rays of each have found.
+"""Filter of per-surfel light: neighbouring surfels share the results of their few rays.
 
-A surfel of 32 shadow rays is a little noisier than a picture may be. Its neighbours on the same surface see
-next to the same light, so each takes the mean of its own share and of theirs, by a Gaussian of distance.
+With 32 shadow rays, a surfel is slightly too noisy for a picture. Its neighbours on the same surface see
+nearly the same light, so their shares are averaged, weighted by a Gaussian of distance.
 """
 
 from __future__ import annotations
@@ -17,11 +17,11 @@ from tron.gaussians.scene import GaussianScene
 from tron.runtime import aligned
 
 NEIGHBOURS = 9
-"""Of a surfel, itself among them."""
+"""Number of neighbours averaged, the surfel itself included."""
 DEVIATION = 0.8
-"""Of the Gaussian, in spacings."""
+"""Standard deviation of the Gaussian, in spacings."""
 AGREEMENT = 0.7
-"""Least cosine between normals of surfels that lend."""
+"""Least cosine between the normals of surfels that are averaged."""
 
 
 @dataclass(frozen=True)
@@ -33,7 +33,7 @@ class Lending:
 
     @classmethod
     def among(cls, scene: GaussianScene) -> Lending:
-        """The nearest of each surfel, itself among them: 0.2 seconds for 50,000 on one core."""
+        """Find each surfel's nearest neighbours, itself included: 0.2 seconds for 50,000 on one core."""
         numbers, weights = alike_neighbours(scene, NEIGHBOURS, DEVIATION, AGREEMENT)
         return cls(
             [mi.UInt32(aligned(each)) for each in numbers.T], [mi.Float(aligned(each)) for each in weights.T]

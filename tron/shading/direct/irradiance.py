@@ -4,8 +4,8 @@ With n rays of each kind, every ray of direction w, whichever way it was drawn, 
 
     L(w) V(w) p_cosine(w) / (n (p_cosine(w) + p_light(w))),      p_cosine = (N.w)+ / pi
 
-which is the balance heuristic (Veach 1997); V is the transmittance of what stands in the way. The sum is E
-/ pi, the radiance of a white diffuse surface. Points in either unit square come from
+which is the balance heuristic (Veach 1997); V is the transmittance along the ray. The sum is E / pi, the
+radiance of a white diffuse surface. Points in either unit square come from
 :mod:`tron.shading.direct.sampling`.
 
 Lanes are those of the G-buffer, pixels in tile order. A lane traces up to four rays of neighbouring strata
@@ -36,10 +36,10 @@ ORIGIN_OFFSET = 0.1
 
 
 class Observer(Protocol):
-    """Sums over rays of their own, such as :class:`tron.shading.direct.noise.NoiseSums`.
+    """Accumulates its own sums over rays, such as :class:`tron.shading.direct.noise.NoiseSums`.
 
-    Of each fan it is told unit world directions, the light that is looked up along them by its weight, and
-    the share of it that arrives.
+    For each fan it receives unit world directions, the weighted radiance along them, and the share of it
+    that arrives.
     """
 
     def add(
@@ -59,7 +59,7 @@ class Occluder(Protocol):
 
 
 class Light(Protocol):
-    """Radiance from afar that can be drawn from: :class:`tron.shading.EnvironmentLight`, or a cubemap."""
+    """Environment that can be sampled: :class:`tron.shading.EnvironmentLight`, or a cubemap."""
 
     def radiance(self, d: mi.Vector3f) -> mi.Color3f: ...
 
@@ -90,7 +90,7 @@ def irradiance(
         spp: shadow rays per pixel, even: half of each kind (all of one kind where ``strategy`` says so).
         seed: root of the rays' random numbers.
         strategy: "mis", or one kind of ray alone, for comparison.
-        observers: are told of every ray.
+        observers: receive every ray.
 
     Returns:
         (shadowed, unshadowed), linear, one lane each of the G-buffer's.
@@ -99,7 +99,7 @@ def irradiance(
         TronError: ``spp`` is odd or not positive.
     """
     plan = RayPlan.make(spp, seed, gbuffer.width, strategy)
-    # Rays stand still where the surface is differentiated.
+    # Rays are constants when the surface is differentiated.
     normal = mi.Vector3f(dr.detach(gbuffer.normal))
     offset = dr.opaque(mi.Float, ORIGIN_OFFSET * tracer.scene.spacing)
     origin = gbuffer.raised(offset)
@@ -118,7 +118,7 @@ def irradiance(
             directions.append(direction)
             active.append(counts)
             values.append(dr.select(counts, radiance * weight, 0))
-        dr.eval(directions, values, active)  # tracers look at the rays more than once
+        dr.eval(directions, values, active)  # tracers read the rays more than once
         visible = tracer.transmittances(Fans(origin, directions, active, normal))
         unshadowed += sum(values)
         shadowed += sum(value * share for value, share in zip(values, visible, strict=True))
@@ -167,7 +167,7 @@ class RayPlan:
 
 
 def visible_share(shadowed: mi.Color3f, unshadowed: mi.Color3f) -> mi.Color3f:
-    """Share of the unshadowed light that arrives, by channel; all of none."""
+    """Share of the unshadowed light that arrives, by channel; 1 if there is no light."""
     return mi.Color3f(*[dr.select(u > 0, s / u, 1) for s, u in zip(shadowed, unshadowed, strict=True)])
 
 

@@ -1,9 +1,9 @@
-"""Mean of a pixel's 5 x 5 neighbourhood over those that lie on its surface, by the G-buffer.
+"""Mean over the neighbours in a pixel's 5 x 5 window that lie on its surface, by the G-buffer.
 
-A neighbour's weight is the B-spline kernel's (1 4 6 4 1), its taps ``step`` pixels apart (Dammertz et al.
-2010), times how far it lies on the same surface: its normal agrees and it is near the pixel's plane; on
-request also how alike a guide is there: exp(-(stop x difference)^2). Pixels that have next to no neighbour on
-their surface, as of leaves and wires, take those that are near it (``LOOSE``, ``ALONE``)."""
+A neighbour's weight is the B-spline kernel (1 4 6 4 1), with taps ``step`` pixels apart (Dammertz et al.
+2010), times a weight for the same surface: normals agree and the neighbour is near the pixel's plane. With a
+guide, it is also multiplied by exp(-(stop x difference)^2) of the guide. Pixels with next to no neighbour on
+their surface, such as leaves and wires, accept neighbours farther from it (``LOOSE``, ``ALONE``)."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ NORMAL_POWER = 32
 PLANE_SPACINGS = 1.0
 """Distance from the pixel's plane, in surfel spacings, at which a neighbour's weight has fallen by e."""
 LOOSE, ALONE = 8.0, 12.0
-"""Times as far, for pixels whose neighbours have no more than this weight, of 220: leaves, wires, fringes."""
+"""Factor on that distance for pixels whose neighbours' total weight, of 220, is below the second number."""
 
 
 def neighbourhood_mean(
@@ -35,7 +35,7 @@ def neighbourhood_mean(
     stop: mi.Float | float = 0.0,
     own: bool = True,
 ) -> tuple[list[mi.Float], mi.Bool]:
-    """Weighted means of ``values`` about each pixel, and where there was anything to average.
+    """Weighted means of ``values`` around each pixel, and whether a pixel had any neighbour to average.
 
     Args:
         values: of each of the G-buffer's lanes, evaluated.

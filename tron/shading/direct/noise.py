@@ -1,17 +1,17 @@
-"""Filter for many rays: neighbours stand in for a pixel as far as its own noise lets them differ.
+"""Filter for many rays: neighbours are averaged that differ no more than the pixel's own noise explains.
 
 With L_k the light of a pixel's rays, V_k the share of it that arrives and V = sum L_k V_k / sum L_k, the
 variance of V is
 
     sum L_k^2 (V_k - V)^2 / (sum L_k)^2
 
-Its mean over the neighbourhood sets how unlike a neighbour may be (Schied et al. 2017, "Spatiotemporal
-Variance-Guided Filtering"). It is that of independent rays; those in strata vary less, the less the more they
-are, so that it is taken times 16 / n of n rays. Where all rays of a neighbourhood agree nothing changes.
+Its mean over the neighbourhood sets how much a neighbour may differ (Schied et al. 2017, "Spatiotemporal
+Variance-Guided Filtering"). This variance assumes independent rays; stratified rays vary less, so it is
+multiplied by 16 / n for n rays. Where all rays of a neighbourhood agree, nothing changes.
 
-Error of the share over that without the filter, a ball on a plane: under a sun 0.99 of 16 rays, 1.00 of 64,
-0.77 of 64 over 2 x 2 sub-pixels; in even light 0.17, 0.26, 0.40. Shares come out 0.001 to 0.002 too large:
-rays that all get through by luck have no variance.
+Ratio of the share's error with the filter to the error without it, for a ball on a plane: under a sun 0.99
+with 16 rays, 1.00 with 64, 0.77 with 64 over 2 x 2 sub-pixels; in even light 0.17, 0.26, 0.40. Shares are
+0.001 to 0.002 too large, because rays that are all unblocked by chance have no variance.
 """
 
 from __future__ import annotations
@@ -29,16 +29,16 @@ if TYPE_CHECKING:
     from tron.tracing import GBuffer
 
 PASSES = (3.0, 2.0)
-"""Difference, in deviations, at which a neighbour's weight has fallen by e, of each pass over the image."""
+"""For each pass, the difference in standard deviations at which a neighbour's weight has fallen by e."""
 _RAYS = 16
-"""Rays a pixel that PASSES were chosen at."""
+"""Rays per pixel for which PASSES were tuned."""
 _LEAST = 1e-4
 """Least such difference; shares are up to 1."""
 
 
 @dataclass
 class NoiseSums:
-    """Sums of luminance over rays, its squares, and those times the share that arrives, by pixel."""
+    """Sums over a pixel's rays of luminance, its square, and products with the share that arrives."""
 
     light: mi.Float
     squares: mi.Float
@@ -69,7 +69,7 @@ class NoiseSums:
         dr.eval(self.light, self.squares, self.arriving, self.arriving_squares)
 
     def variance(self, share: mi.Float) -> mi.Float:
-        """Variance of the share of light that arrives, which is ``share``; 0 without light."""
+        """Variance of ``share``, the share of light that arrives; 0 without light."""
         total = self.arriving_squares - 2 * share * self.arriving + share * share * self.squares
         light = dr.select(self.light > 0, self.light, 1)
         return dr.maximum(total, 0) / (light * light)
@@ -83,7 +83,7 @@ def without_noise(
     gbuffer: GBuffer,
     spacing: float,
 ) -> tuple[mi.Color3f, mi.Color3f]:
-    """Filter both estimates of irradiance / pi with common weights; where nothing is noisy they stay.
+    """Filter both estimates of irradiance / pi with common weights; noiseless pixels are unchanged.
 
     Args:
         shadowed, unshadowed: linear, from the same rays.

@@ -2,16 +2,16 @@
 
 The first two dimensions of Sobol's sequence are a (0, 2)-sequence: of any aligned run of 2^k points, every
 dyadic rectangle of area 2^-k holds exactly one (Sobol 1967). A pixel takes such a run, so its points are
-stratified in every way at once; the four pixels of a block, the sixteen of the next, and so on take runs that
-lie together, so neighbours share out the strata and their errors differ in sign: noise is pushed towards high
+stratified in every way at once. The four pixels of a block, the sixteen of the next larger one, and so on
+take consecutive runs, so neighbours divide the strata and their errors differ in sign: noise moves to high
 frequencies, where a filter and the eye remove it (Ahmed and Wonka 2020, "Screen-Space Blue-Noise Diffusion of
 Monte Carlo Sampling Error via Hierarchical Ordering of Pixels"). Owen scrambling (Laine and Karras 2011;
 Burley 2020, "Practical Hash-based Owen Scrambling") makes every point uniform by itself, so estimates are
 unbiased, and keeps all of that structure; it also shuffles the Z order.
 
 Within a pixel the points come in the order of their strata, the same for all pixels: neighbouring lanes then
-send rays in neighbouring directions, and so do four consecutive points of one lane. All of this holds for
-2^k points a pixel; other numbers take what comes next in the sequence, and are merely well spread.
+send rays in neighbouring directions, and so do four consecutive points of one lane. All of this holds for 2^k
+points per pixel; for other counts the points are simply the next in the sequence, and merely well spread.
 """
 
 from __future__ import annotations
@@ -65,7 +65,7 @@ def morton(x: mi.UInt32, y: mi.UInt32) -> mi.UInt32:
 
 
 def has_strata(count: int) -> bool:
-    """Whether runs of ``count`` points are stratified: whether it is a power of two."""
+    """Whether runs of ``count`` points are stratified: ``count`` is a power of two."""
     return count & (count - 1) == 0
 
 
@@ -109,10 +109,10 @@ class PixelPoints:
 
     Attributes:
         count: points a pixel, in each set.
-        order: indices within a pixel's run of points, in the order in which they are used: by strata where
-            ``count`` is a power of two; otherwise there are none, and the sequence is used as it comes.
+        order: indices within a pixel's run of points, in order of use: by strata if ``count`` is a power of
+            two; otherwise empty, and the sequence is used in its own order.
         shift: see :func:`row_shift`; zero without strata.
-        row_mask: of the bits that ``shift`` is looked up by.
+        row_mask: mask of the bits that index ``shift``.
         seeds: of the pixels' order, then of columns and rows of each set.
         width, across: pixels and blocks across the image.
     """
@@ -144,7 +144,7 @@ class PixelPoints:
 
     @property
     def fan(self) -> int:
-        """Rays by these points that are traced together: consecutive, within an eighth of the unit square."""
+        """Number of consecutive points, in an eighth of the unit square, whose rays are traced together."""
         return next(k for k in (4, 2, 1) if (has_strata(self.count) and self.count >= 8 * k) or k == 1)
 
     def run(self, pixel: mi.UInt32) -> mi.UInt32:
@@ -155,7 +155,7 @@ class PixelPoints:
         rank = (block << (2 * BLOCK_BITS)) | morton(x & low, y & low)
         # From the highest bit down: blocks of pixels of every size stay together.
         rank = dr.brev(scramble(dr.brev(rank), dr.gather(mi.UInt32, self.seeds, 0)))
-        # Runs follow each other without gaps: a point that no pixel takes would be missing everywhere.
+        # Runs follow each other without gaps: a point that no pixel takes would leave a hole in the strata.
         return rank * dr.opaque(mi.UInt32, self.count)
 
     def point(self, run: mi.UInt32, i: mi.UInt32, which: mi.UInt32) -> mi.Point2f:

@@ -1,4 +1,4 @@
-"""Share of the unshadowed irradiance that reaches each point, as an :class:`Estimation` has it."""
+"""Share of the unshadowed irradiance that reaches each point, estimated as an :class:`Estimation` says."""
 
 from __future__ import annotations
 
@@ -32,10 +32,10 @@ def visibility(
     """Share of the unshadowed irradiance that reaches each pixel, by channel in [0, 1].
 
     Args:
-        tracer: what casts shadows.
+        tracer: the occluders.
         gbuffer: positions, unit normals and opacity of the pixels.
         lighting: the prepared environment.
-        estimation: how.
+        estimation: how it is estimated.
         seed: root of the shadow rays' random numbers.
     """
     estimation = estimation.of_pixels()
@@ -60,10 +60,10 @@ def reaching_share(
     narrow: NarrowSums | None = None,
     noise: NoiseSums | None = None,
 ) -> mi.Color3f:
-    """The same from what the rays found: :func:`tron.shading.direct.irradiance`'s two estimates.
+    """Visibility from the two estimates of :func:`tron.shading.direct.irradiance`.
 
-    ``narrow`` and ``noise`` of the same rays, for the filters of few and of many rays; None: no light is
-    narrow, nothing is noisy.
+    ``narrow`` and ``noise`` come from the same rays, for the filters of few and of many rays. None: no light
+    is narrow, nothing is noisy.
     """
     plain, many = estimation.estimator == "plain", estimation.rays >= RATIO_FROM_RAYS
     if noise is not None:
@@ -96,12 +96,11 @@ def shading_normal(surface: Surface) -> mi.Vector3f:
 #     below           1 - (b + g (U - u)) / U, within [0, 1],      b = u - s, the light that is blocked
 #                     g = cov(b, u) / var(u) over the neighbours' rays, without the pixel's own
 #
-# Both give exactly 1 where every ray is open. The ratio is biased at few rays: where the ray after the light
-# misses a sun, the others say that all arrives, of a U that holds the sun. The regression is not, whatever
-# g, because g does not know the pixel's own rays and u - U is 0 in the mean: a control variate (Owen, "Monte
-# Carlo theory, methods and examples", 8.9). g is the part of u's noise that is blocked: 0 in the open, 1 in
-# a dark umbra. What bias is left comes from the clamp. g is taken from luminances. A pixel without
-# neighbours keeps the ratio.
+# Both give exactly 1 where every ray is open. The ratio is biased at few rays: if no ray goes to a sun, the
+# others say that all light arrives, and U includes the sun. The regression is unbiased for any g, because g
+# is independent of the pixel's own rays and u - U has mean 0: a control variate (Owen, "Monte Carlo theory,
+# methods and examples", 8.9). g is the blocked part of u's noise: 0 in the open, 1 in a dark umbra. The clamp
+# leaves some bias. g is computed from luminances. A pixel without neighbours keeps the ratio.
 #
 # Mean over reference in shadowed pixels and RMSE of all, over an upward plane's light (128 x 128, 20k
 # surfels of a seed that no benchmark uses):
@@ -112,7 +111,7 @@ def shading_normal(surface: Surface) -> mi.Vector3f:
 #     8       1.04  0.038     1.00  0.036     1.01  0.087     1.01  0.084
 
 RATIO_FROM_RAYS = 16
-"""Rays a pixel from which the ratio is used."""
+"""Rays per pixel from which the ratio is used."""
 
 
 def regressed_share(
@@ -128,7 +127,7 @@ def regressed_share(
     """
     blocked = unshadowed - shadowed
     part, found = _blocked_part_of_noise(mi.luminance(blocked), mi.luminance(unshadowed), gbuffer, spacing)
-    # Of a pixel alone g is b / u, and the regression the ratio.
+    # For a pixel without neighbours g is b / u, and the regression is the ratio.
     ratio = visible_share(shadowed, unshadowed)
     lost = blocked + part * (known - unshadowed)
     share = [dr.select(k > 0, dr.clip(1 - lost_ / k, 0, 1), 1) for lost_, k in zip(lost, known, strict=True)]
@@ -140,7 +139,7 @@ def regressed_share(
 def _blocked_part_of_noise(
     blocked: mi.Float, unshadowed: mi.Float, gbuffer: GBuffer, spacing: float
 ) -> tuple[mi.Float, mi.Bool]:
-    """g of this module in [0, 1], and where there are neighbours to take it from."""
+    """g of this module in [0, 1], and whether a pixel has neighbours to compute it from."""
     moments = [blocked, unshadowed, blocked * unshadowed, unshadowed * unshadowed]
     dr.eval(moments)
     (b, u, bu, uu), found = neighbourhood_mean(moments, gbuffer, spacing, own=False)
@@ -148,25 +147,25 @@ def _blocked_part_of_noise(
     return dr.select(variance > 0, dr.clip((bu - b * u) / variance, 0, 1), 0), found
 
 
-# A light as narrow as a sun has shadows with an edge, and a thin thing's shadow is a few pixels wide. A
-# pixel whose ray was sent to the sky knows nothing of it, though, and would say that all arrives. So rays
-# along which the light is drawn more than ``NARROW`` times a steradian are summed by themselves: a disc
-# that sends all light has that density at 3 degrees' width. Their visibility has no noise but in penumbras;
-# where a pixel has no such ray, its neighbours' stand in:
+# A light as narrow as a sun casts hard shadows, and a thin object's shadow is a few pixels wide. But a pixel
+# whose ray went to the sky does not sample the sun, and would say that all light arrives. So rays whose
+# density of drawing the light exceeds ``NARROW`` per steradian are summed separately: a disc that sends all
+# light has that density at 3 degrees' width. Their visibility is noisy only in penumbras; a pixel without
+# such a ray uses its neighbours':
 #
 #     V = (s + e <s>) / (u + e <u>),   share of the light that is narrow = <u> / <all u>
 #
-# with s and u the sums of those rays with and without what is in their way, <> means of 5 x 5 pixels, e 0.1.
+# with s and u the sums of those rays with and without occlusion, <> means over 5 x 5 pixels, and e = 0.1.
 
 NARROW = 500.0
-"""Least density of narrow lights, per steradian; of the two degrees' radius of the benchmark's sun 150."""
+"""Least density of narrow lights, per steradian; the benchmark's sun, of two degrees' radius, has 150."""
 NEIGHBOURS = 0.1
 STOP = 2.0
 
 
 @dataclass
 class NarrowSums:
-    """Sums of luminance over rays to narrow lights, with and without what is in their way, by pixel."""
+    """Sums of luminance over rays to narrow lights, with and without occlusion, by pixel."""
 
     light: Light
     shadowed: mi.Float
@@ -190,11 +189,11 @@ class NarrowSums:
         dr.eval(self.shadowed, self.unshadowed)
 
     def detail(self, unshadowed: mi.Float, gbuffer: GBuffer, spacing: float) -> mi.Float:
-        """The part of the share of light that arrives which narrow lights decide, in [0, 1].
+        """The narrow lights' part of visibility, in [0, 1].
 
         Args:
-            unshadowed: sums of luminance over all rays without what is in their way.
-            gbuffer, spacing: as of :func:`neighbourhood_mean`.
+            unshadowed: sums of luminance over all rays without occlusion.
+            gbuffer, spacing: as in :func:`neighbourhood_mean`.
         """
         sums = [self.shadowed, self.unshadowed, unshadowed]
         dr.eval(sums)
@@ -211,26 +210,26 @@ class NarrowSums:
         return detail
 
 
-# The shadowed and the unshadowed estimate go through the same weights and their ratio is kept: it loses
-# noise but not the shading of curved surfaces (Heitz et al. 2018, "Combining Analytic Direct Illumination
-# and Stochastic Shadows"), and of a neighbourhood's rays it is not biased as it is of a pixel's few.
+# The shadowed and the unshadowed estimate are filtered with the same weights and their ratio is used: it has
+# less noise but keeps the shading of curved surfaces (Heitz et al. 2018, "Combining Analytic Direct
+# Illumination and Stochastic Shadows"), and over a neighbourhood's rays its bias is small.
 #
-# Weights that look at the noise they weigh choose by it, and without any the filter draws light into
-# shadow. So they look at a guide: the share of light that arrives, itself smoothed by three small passes,
-# the last of them guided by what the first two left. Three passes of the filter follow, taps 1, 2 and 4
-# pixels apart, and the farther they reach, the more alike the guide must be.
+# Weights computed from the noisy values themselves are biased by the noise, and without such weights light
+# leaks into shadows. So weights use a guide: the share of light that arrives, smoothed by three small passes,
+# the last of them guided by the result of the first two. Three passes of the filter follow, with taps 1, 2
+# and 4 pixels apart; the farther they reach, the more alike the guide must be.
 #
-# What is smoothed so is blind to shadows of a few pixels' width: it led their light in. So what narrow lights
-# say is taken off the guide before it is smoothed, and put back
-# after. Of bars 0.04 wide under a sun of 1 degree the deep shadow has 1.34, 1.20 and 1.10 of the reference at
-# 2, 4 and 8 rays; of 20k surfels all shadows have 1.04 of it or less, with a third less noise.
-# Of many rays it would blur more than it cleans: :mod:`tron.shading.direct.noise` is theirs.
+# Such a guide misses shadows a few pixels wide, and light would leak into them. So the narrow lights' part is
+# subtracted from the guide before it is smoothed, and added again
+# after. Under bars 0.04 wide and a sun of 1 degree, the deep shadow has 1.34, 1.20 and 1.10 of the reference
+# at 2, 4 and 8 rays; on 20k surfels all shadows have 1.04 of it or less, with a third less noise.
+# For many rays it would blur more than it denoises; they use :mod:`tron.shading.direct.noise`.
 
 GUIDE_PASSES = ((1, 0.0), (1, 0.0), (2, 4.0))
 """Step in pixels and stop of each pass that smooths the guide; a stop is over the share of light, 0 to 1."""
 FILTER_PASSES = ((1, 4.0), (2, 8.0), (4, 12.0))
 FILTER_REACH = 2 * (1 + 1 + sum(step for step, _ in GUIDE_PASSES) + sum(step for step, _ in FILTER_PASSES))
-"""Pixels that filtered light depends on around one: two taps a pass, of narrow lights, guide and filter."""
+"""Radius, in pixels, that filtered light depends on: two taps per pass of narrow lights, guide and filter."""
 
 
 def atrous(
@@ -245,7 +244,7 @@ def atrous(
 
     Args:
         shadowed, unshadowed: linear, from the same rays.
-        share: of the light that arrives, in [0, 1], to be smoothed and guide the weights.
+        share: share of the light that arrives, in [0, 1]; smoothed, it guides the weights.
         gbuffer: positions, unit normals and opacity of the same pixels.
         spacing: the scene's surfel spacing, world units.
         detail: part of the share that is known without noise and not to be smoothed in the guide.

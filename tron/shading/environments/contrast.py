@@ -1,4 +1,4 @@
-"""How hard the shadows are that a light casts: its measured contrast, and three classes of it."""
+"""Contrast of a light, a measure of how hard its shadows are, and three classes of it."""
 
 from __future__ import annotations
 
@@ -12,17 +12,17 @@ HIGH_CONTRAST = 0.3
 """Share above which a map casts distinct shadows."""
 
 LOW_CONTRAST = 0.12
-"""Share up to which it hardly casts any."""
+"""Share up to which a map hardly casts any shadows."""
 
 CONTRAST_ROWS = 64
-"""Rows of the map that is measured: a class does not depend on the resolution of a bake."""
+"""Rows to which a map is reduced for measuring, so that its class does not depend on its resolution."""
 
 INTERVALS: dict[Contrast, tuple[float, float]] = {
     "high": (HIGH_CONTRAST, 1.0),
     "medium": (LOW_CONTRAST, HIGH_CONTRAST),
     "low": (0.0, LOW_CONTRAST),
 }
-"""Class -> shares above the first number and up to the second.
+"""Class -> interval of shares, above the first number and up to the second.
 
 The share is 0.01 for a constant, near 1 for a bare lamp. Of 80 lights of each of our eight families (seeds 0
 to 79), 28 % lie below LOW_CONTRAST, in the valley between covered skies and the rest, and 56 % above

@@ -1,4 +1,4 @@
-"""The cubemap: radiance on six square faces, the form in which a light is fitted and filtered.
+"""The cubemap: radiance on six square faces, used to fit and filter a light.
 
 Faces are +x, -x, +y, -y, +z, -z; u and v in [-1, 1] run along the next two axes in cyclic order (for +-x: y
 and z; +-y: z and x; +-z: x and y). Texels are centred, so beside an edge a bilinear lookup needs texels of
@@ -6,8 +6,8 @@ the next face. Each face therefore carries a border of one texel: across an edge
 at the same place along the edge, at the cube's eight corners the mean of the three texels that meet there.
 Both faces then compute the same value all along their edge: radiance is continuous on the sphere.
 
-Everything here is differentiable with respect to the texels, except the density that directions are drawn
-from, which is a choice and no result.
+Everything here is differentiable with respect to the texels, except the sampling density, which is a choice
+and not a result.
 """
 
 from __future__ import annotations
@@ -115,7 +115,7 @@ class CubemapLight:
             )
         self.texels, self.resolution = texels, resolution
         self._bordered = _bordered(texels, resolution)
-        # Not on demand: the demand comes from inside a symbolic loop, where nothing can be evaluated.
+        # Not on demand: it is first needed inside a symbolic loop, where nothing can be evaluated.
         self._distribution = _RowsAndColumns(dr.detach(self._bordered), resolution)
         self._width, self._first = dr.opaque(mi.UInt32, resolution), dr.opaque(mi.UInt32, 0)
 

@@ -34,7 +34,7 @@ PDF_WIDTH = 512
 PDF_FLOOR = 0.01
 """Least density of a cell, relative to the mean: no direction is impossible, so lookups stay unbiased."""
 
-_ROWS = 64  # of the map that a plane's light is summed over: more are slower, fewer blur what grazes it
+_ROWS = 64  # of the map for summing a plane's light: more are slower, fewer blur grazing light
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,7 +63,7 @@ class EnvironmentMap:
 
     @classmethod
     def load(cls, path: str | Path, rotation_deg: float = 0.0) -> EnvironmentMap:
-        """Read a lat-long picture of light; :func:`read_light` says what is mended.
+        """Read a lat-long picture of light; :func:`read_light` lists the defects that are repaired.
 
         Raises:
             TronError: missing or unreadable file, another suffix, or an image that is no environment map.
@@ -101,7 +101,7 @@ class EnvironmentMap:
         return replace(self, rotation_deg=(self.rotation_deg + degrees) % 360.0)
 
     def turned(self, turn: np.ndarray) -> EnvironmentMap:
-        """The same light in a world that is turned by ``turn`` (3, 3): looked up anew, so a little softer."""
+        """The same light in a world turned by ``turn`` (3, 3): resampled, so slightly softer."""
         return EnvironmentMap(self.lookup(self.directions() @ np.asarray(turn, np.float64)))
 
     def resized(self, height: int, width: int | None = None) -> EnvironmentMap:
@@ -206,7 +206,7 @@ class EnvironmentLight:
         self.environment = environment
         image = environment.image
         height, width = image.shape[:2]
-        # Opaque numbers: lights of other sizes and rotations must share one compiled kernel.
+        # Opaque numbers: lights of all sizes and rotations must share one compiled kernel.
         self._width, self._last_row = dr.opaque(mi.Int, width), dr.opaque(mi.Int, height - 1)
         rgba = np.concatenate([image, np.zeros_like(image[..., :1])], axis=-1)
         self._texels = mi.Float(aligned(rgba.ravel()))

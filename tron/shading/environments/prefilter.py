@@ -143,14 +143,14 @@ def ggx_prefilter(
 
 @cache
 def _quadrature() -> tuple[np.ndarray, np.ndarray]:
-    """Gauss-Legendre's nodes and weights: finding them costs far more than a sum over them."""
+    """Gauss-Legendre nodes and weights, cached: finding them costs far more than a sum over them."""
     return np.polynomial.legendre.leggauss(200)
 
 
 def lobe_length(alpha: float) -> float:
-    """Length of the mean direction of that lobe: 1 of a mirror's, 2/3 at alpha = 1."""
+    """Length of the mean direction of a prefiltering lobe: 1 for a mirror, 2/3 at alpha = 1."""
     nodes, weights = _quadrature()
-    # By the logarithm of what D is a square of: the peak of a narrow lobe has as many nodes as its tail.
+    # In the logarithm of D's square root, so that a narrow lobe's peak gets as many nodes as its tail.
     least, most = alpha**2, (1 + alpha**2) / 2
     lobe = least * (most / least) ** ((nodes + 1) / 2)
     cosine = 1 - 2 * (lobe - least) / (1 - alpha**2)

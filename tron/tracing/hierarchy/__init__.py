@@ -1,1 +1,1 @@
-"""All other rays through a bounding volume hierarchy."""
+"""Shadow and bounce rays through a bounding volume hierarchy."""

@@ -1,12 +1,12 @@
-"""A bounding volume hierarchy for arbitrary rays: perfectly balanced, four children a node, no stack.
+"""A bounding volume hierarchy for arbitrary rays: perfectly balanced, four children per node, no stack.
 
-Built by median splits of the longest axis, round by round, all parts at once: the surfels of a part are
-neighbours in the order, a power of two of them, and one sort by (part, coordinate along the part's longest
-axis) splits them all. What is missing to a power of two stands at the end as empty places. Two rounds make
-the four children of a node. Then the shape of the tree is arithmetic: with the root called 1, the children of
-node i are 4 i to 4 i + 3, and those from 4^levels on are leaves, in the order of their surfels.
+It is built by median splits of the longest axis, round by round, all parts at once: the surfels of a part are
+consecutive, a power of two of them, and one sort by (part, coordinate along the part's longest axis) splits
+all parts. Empty places at the end fill up to the power of two. Two rounds make the four children of a node.
+The shape of the tree is then arithmetic: with the root numbered 1, the children of node i are 4 i to 4 i + 3,
+and nodes from 4^levels on are leaves, in the order of their surfels.
 
-When surfels move, the order stays good for a while and the boxes alone are made anew (:func:`refit`).
+When surfels move, the order stays good for a while and only the boxes are recomputed (:func:`refit`).
 
 A node holds its four children's boxes, not its own, so that one read decides about all four: 12 32-bit words
 (three packets) of
@@ -14,13 +14,13 @@ A node holds its four children's boxes, not its own, so that one read decides ab
     origin x, y, z; step x, y, z; and for each axis the four centres and the four half sizes, a byte each
 
 in steps of 1/250 of the node's own box, half sizes in half steps, rounded outwards, 0 for an empty child. A
-grid for each node, not one for the scene, costs nothing and is as fine as the node is small: a surfel that
-strayed far off coarsens no box but its ancestors' (compressed wide nodes: Ylitie et al. 2017, "Efficient
-Incoherent Ray Traversal on GPUs Through Compressed Wide BVHs"). Nor do those coarsen their siblings': a child
-much larger than all the others together is visited by every ray, and the grid spans the others.
+grid per node instead of one for the scene costs nothing, and it is fine where the node is small: a stray
+surfel coarsens only its ancestors' boxes (compressed wide nodes: Ylitie et al. 2017, "Efficient Incoherent
+Ray Traversal on GPUs Through Compressed Wide BVHs"). The ancestors do not coarsen their siblings: a child
+much larger than all the others together is visited by every ray, and the grid spans the others only.
 
-The ancestors of strays are kept few: strays, farther from the bulk of the surfels than ``STRAY_SIZES`` times
-its size, come last in every part that they share with others, and so end together in the last subtree.
+Strays are surfels farther from the bulk of the surfels than ``STRAY_SIZES`` times its size. To keep their
+ancestors few, they come last in every part that they share with others, and so share the last subtree.
 """
 
 from __future__ import annotations
@@ -37,15 +37,15 @@ from tron.tracing.kernel import GEOMETRY_PACKETS, SurfelRecords, half_axes
 LEAF_SIZE = 2
 CHILDREN = 4
 ROUNDS = 2
-"""Rounds of splits to a level."""
+"""Rounds of splits per level."""
 NODE_PACKETS = 3
 STEPS = 250.0
 """Steps of a node's own grid along each axis; with rounding and slack a byte holds them."""
 EVERYWHERE = 255
-"""Half size of a child that every ray visits: one ``ALOOF`` times as large as all the others together."""
+"""Half size marking a child that every ray visits: it is ``ALOOF`` times as large as all its siblings."""
 ALOOF = 32.0
 THICKNESS = 1 / 1024
-"""Every surfel's box is widened by this share of its largest extent: flat ones must survive float32."""
+"""Every surfel's box is widened by this share of its largest extent, so that flat boxes survive float32."""
 STRAY_SIZES = 8.0
 STRAY_SHARE = 0.01
 """Largest share of the surfels, at each end of each axis, that can be strays."""
@@ -59,13 +59,13 @@ class Bvh:
     """The hierarchy and its surfels.
 
     Attributes:
-        nodes: mi.UInt32, ``4 * NODE_PACKETS`` words for each of nodes 0 to 4^levels - 1; some are never read.
+        nodes: mi.UInt32, ``4 * NODE_PACKETS`` words per node 0 to 4^levels - 1; some are never read.
         first_above_leaves: opaque mi.UInt32 of one lane, 4^(levels - 1): the first node whose children are
             leaves; opaque, so that scenes of any size share one kernel.
-        geometry: mi.Float, geometry records in leaf order, up to a whole leaf.
+        geometry: mi.Float, geometry records in leaf order, padded to a whole leaf.
         order: mi.UInt32 (M,), leaf order -> scene order.
-        area: mi.Float of one lane, summed half surface of all boxes over the root's: how many boxes a random
-            ray that meets the root's is expected to meet (Goldsmith and Salmon 1987).
+        area: mi.Float of one lane, half surface of all boxes together over the root box's: the expected
+            number of boxes met by a random ray that meets the root's (Goldsmith and Salmon 1987).
         levels: levels below the root, 1 or more.
         degree: kernel degree.
     """
@@ -80,20 +80,20 @@ class Bvh:
 
 
 def build_bvh(records: SurfelRecords) -> Bvh:
-    """Build the hierarchy of a scene's surfels, none included."""
+    """Build the hierarchy of a scene's surfels; a scene may have none."""
     leaves = -(-max(records.count, 1) // LEAF_SIZE)
     rounds = (leaves - 1).bit_length()
-    # Where the root has two children of its four, the round that would make the others has nothing to split.
+    # A root with two children instead of four needs one round fewer.
     return refit(_median_order(records, rounds), max(1, -(-rounds // ROUNDS)), records)
 
 
 def refit(order: mi.UInt32, levels: int, records: SurfelRecords) -> Bvh:
-    """Boxes for surfels that keep their ``order``; quick, exact, and tight while neighbours stay neighbours.
+    """Recompute the boxes and keep the ``order``: quick, exact, and tight while neighbours stay neighbours.
 
     Args:
         order: (M,) leaf order -> scene order, of an earlier hierarchy of M surfels.
         levels: that hierarchy's levels.
-        records: the surfels where they are now.
+        records: the surfels at their present places.
     """
     places = LEAF_SIZE << (ROUNDS * levels)
     geometry = _in_leaf_order(records, order)
@@ -124,7 +124,7 @@ def _in_leaf_order(records: SurfelRecords, order: mi.UInt32) -> mi.Float:
     places = -(-max(records.count, 1) // LEAF_SIZE) * LEAF_SIZE
     geometry = dr.empty(mi.Float, 4 * GEOMETRY_PACKETS * places)
     place = dr.arange(mi.UInt32, places)
-    # A last leaf of one surfel is filled up with a record of negative radius, which no ray meets.
+    # A last leaf with one surfel is padded with a record of negative radius, which no ray meets.
     held = place < dr.opaque(mi.UInt32, records.count)
     source = dr.gather(mi.UInt32, order, place, held)
     for packet in range(GEOMETRY_PACKETS):
@@ -136,7 +136,7 @@ def _in_leaf_order(records: SurfelRecords, order: mi.UInt32) -> mi.Float:
 
 
 def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, mi.Vector3f]:
-    """Tight boxes of the cut disks; empty (low > high) for surfels that count nowhere and empty places."""
+    """Tight boxes of the cut disks; empty (low > high) for empty places and surfels that count nowhere."""
     place = dr.arange(mi.UInt32, places)
     real = place < dr.opaque(mi.UInt32, count)
     centre, u, v = (
@@ -153,7 +153,7 @@ def _bounds(geometry: mi.Float, count: int, places: int) -> tuple[mi.Vector3f, m
 
 
 def _pairs(values: mi.Vector3f, reduce: Callable[..., Any]) -> mi.Vector3f:
-    """Reduce neighbours two by two."""
+    """Merge neighbours in pairs."""
     even = 2 * dr.arange(mi.UInt32, dr.width(values) // 2)
     left, right = (mi.Vector3f(*[dr.gather(mi.Float, v, even + side) for v in values]) for side in (0, 1))
     result = reduce(left, right)
@@ -195,7 +195,7 @@ def _write_level(words: mi.UInt32, level: int, box: Box, children: Box) -> None:
         middle = dr.select(filled, 0.5 * (first + last) - origin, 0)
         centre = dr.clip(dr.round(middle / step), 0, 255)
         reach = dr.maximum(0.5 * (last - first), 0) + dr.abs(middle - centre * step)
-        # Half a step of slack covers the float32 rounding of this very quantisation.
+        # Half a step of slack covers the float32 rounding of this quantisation.
         half = dr.clip(dr.ceil(2 * reach / step) + 1, 1, EVERYWHERE - 1)
         half = dr.select(aloof[child], EVERYWHERE, half)
         centres |= mi.Vector3u(centre) << (8 * child)
@@ -235,7 +235,7 @@ def _median_order(records: SurfelRecords, rounds: int) -> mi.UInt32:
 
 
 def _bulk(records: SurfelRecords) -> Box:
-    """Box outside which a surfel is a stray: far from where all but ``STRAY_SHARE`` of a sample are."""
+    """Box outside which a surfel is a stray, from the bounds of all but ``STRAY_SHARE`` of a sample."""
     count = min(max(records.count, 1), _SAMPLE)
     sample = dr.arange(mi.UInt32, count) * dr.opaque(mi.UInt32, max(records.count, 1) // count)
     centre = dr.gather(mi.Vector4f, dr.detach(records.geometry), sample * GEOMETRY_PACKETS)
@@ -254,7 +254,7 @@ def _bulk(records: SurfelRecords) -> Box:
 
 
 def _extent(centre: mi.Vector3f, which: mi.Bool, size: int) -> Box:
-    """Boxes of some of the centres of each part of ``size`` places."""
+    """Bounding boxes of the selected centres in each part of ``size`` places."""
     low, high = dr.select(which, centre, dr.inf), dr.select(which, centre, -dr.inf)
     dr.eval(low, high)
     return _reduce(dr.ReduceOp.Min, low, size), _reduce(dr.ReduceOp.Max, high, size)
@@ -276,9 +276,9 @@ def _keys(
     """Sort keys: the part in the high bits, the coordinate on its longest axis in the ``bits`` low ones.
 
     Args:
-        centre: of the surfel at each place. real: there is one. stray: it lies far off.
-        alone: (parts,) strays are among themselves. box: (parts,) of the others, or of them.
-        shift: log2 of the places of a part.
+        centre: of the surfel at each place. real: the place is not empty. stray: its surfel is a stray.
+        alone: (parts,) the part holds strays only. box: (parts,) of its other surfels; of strays, if alone.
+        shift: log2 of a part's number of places.
     """
     part = dr.arange(mi.UInt32, dr.width(centre)) >> shift
     low, high = (mi.Vector3f(*[dr.gather(mi.Float, v, part) for v in bound]) for bound in box)
@@ -292,6 +292,6 @@ def _keys(
     most = (mi.UInt32(1) << bits) - 3
     share = dr.clip((pick(centre) - pick(low)) / dr.maximum(pick(size), 1e-30), 0, 1)
     coordinate = dr.minimum(mi.UInt32(share * mi.Float(most)), most)
-    # Strays come behind the others of their part, and empty places last.
+    # Strays come after the other surfels of their part, and empty places last.
     coordinate = dr.select(stray & ~dr.gather(mi.Bool, alone, part), most + 1, coordinate)
     return (part << bits) | dr.select(real, coordinate, most + 2)

@@ -1,17 +1,17 @@
-"""Stochastic first hits: one surfel a ray, met with exactly the weight that compositing gives it.
+"""Stochastic first hits: one surfel per ray, whose probability is its compositing weight.
 
-A surfel stops a ray with probability alpha, whatever the others do, and the nearest that does is found. So
-surfel i is found with the probability that it stops the ray and none before it does,
+Each surfel stops a ray with probability alpha, independently of the others, and the nearest one that does is
+returned. So surfel i is returned if it stops the ray and none before it does:
 
     P(i) = alpha_i prod_{j < i} (1 - alpha_j) = T_i alpha_i,
 
-which is its weight in front-to-back compositing: the value of the surfel that is found is an unbiased
+which is its weight in front-to-back compositing. The value of the returned surfel is therefore an unbiased
 estimate of the composited value (stochastic transparency: Enderton et al. 2010). Nothing is sorted, no list
-is kept, and what lies behind a stop is culled. Sides count as they do for shadow rays
-(:mod:`tron.tracing.hierarchy.transmittance`), so a ray meets nothing with its transmittance's probability.
+is kept, and surfels behind a stop are culled. Sides count as for shadow rays
+(:mod:`tron.tracing.hierarchy.transmittance`), so the probability of no hit is the ray's transmittance.
 
-Whether a surfel stops a ray is decided by a hash of the ray's seed and of the surfel's place in the scene:
-in which order a walk meets surfels, and how a hierarchy sorts them, changes nothing.
+A hash of the ray's seed and the surfel's number in the scene decides whether the surfel stops the ray, so the
+result does not depend on the order of a walk or on how a hierarchy sorts the surfels.
 """
 
 from __future__ import annotations
@@ -29,18 +29,18 @@ from tron.tracing.hierarchy.traversal import Descent, State, any_of, look, searc
 from tron.tracing.kernel import intersect, recorded
 
 NOTHING = 0xFFFFFFFF
-"""In place of a surfel where a ray meets none."""
+"""Surfel number of a ray that meets none."""
 _NO_FAN = 0xFFFFFFFF
 
 
 @dataclass
 class FirstHit:
-    """The surfel that stops each ray, one lane a ray.
+    """The surfel that stops each ray, one lane per ray.
 
     Attributes:
-        surfel: mi.UInt32, in the scene's order; ``NOTHING`` where there is none.
+        surfel: mi.UInt32, in the scene's order; ``NOTHING`` if none stops the ray.
         front: mi.Bool, the ray meets the side that its normal points to.
-        distance: mi.Float, along the unit ray, world units; infinity where there is none.
+        distance: mi.Float, along the unit ray, world units; infinity if none stops the ray.
     """
 
     surfel: mi.UInt32
@@ -56,9 +56,9 @@ def hashed(word: mi.UInt32) -> mi.UInt32:
 
 
 def ray_seeds(root: mi.UInt32, lane: mi.UInt32, ray: mi.UInt32) -> mi.UInt32:
-    """Seeds for :func:`first_hits`: of ray ``ray`` of ``lane``, below ``root`` of :mod:`tron.seeds`.
+    """Seeds for :func:`first_hits`, of ray ``ray`` of ``lane``, below ``root`` of :mod:`tron.seeds`.
 
-    All three opaque, or kernels are compiled for each.
+    All three must be opaque; a literal would compile a kernel for each of its values.
     """
     return hashed(hashed(hashed(root) + lane) + ray)
 
@@ -68,8 +68,8 @@ class Stops:
     """The nearest stop so far of each ray of a fan.
 
     Attributes:
-        nearest, farthest: as walks have them; farthest is where the ray is stopped.
-        surfel: in the scene's order, or ``NOTHING``. front: which side. seed: the ray's.
+        nearest, farthest: as in :class:`Intervals`; farthest is the distance of the stop.
+        surfel: in the scene's order, or ``NOTHING``. front: the side met. seed: the ray's.
     """
 
     nearest: list[mi.Float]
@@ -80,7 +80,7 @@ class Stops:
 
     @staticmethod
     def none(active: Sequence[mi.Bool], seeds: Sequence[mi.UInt32]) -> Stops:
-        """Nothing met yet, by the rays that are traced."""
+        """Initial state of the rays to trace: nothing met yet."""
         return Stops(
             nearest=[mi.Float(0) for _ in active],
             farthest=[dr.select(mi.Bool(lanes), mi.Float(dr.inf), -dr.inf) for lanes in active],
@@ -97,7 +97,7 @@ def stop(
     back_faces: BackFaces,
     normal: mi.Vector3f,
 ) -> Callable[[Stops, mi.UInt32, mi.Bool], Stops]:
-    """Visitor of a walk: a surfel may stop each ray."""
+    """Visitor of a walk: let a surfel stop each ray, by chance."""
 
     def visit(state: Stops, place: mi.UInt32, active: mi.Bool) -> Stops:
         surfel = dr.gather(mi.UInt32, bvh.order, place, active)
@@ -116,15 +116,15 @@ def stop(
 
 
 def first_hits(bvh: Bvh, fans: Fans, back_faces: BackFaces, seeds: Sequence[mi.UInt32]) -> list[FirstHit]:
-    """The stop of each ray: a :class:`FirstHit` for each direction of the fans.
+    """Find the surfel that stops each ray: a :class:`FirstHit` for each direction of the fans.
 
-    Evaluated at once, unless within a recorded loop.
+    Evaluated at once, except within a recorded loop.
 
     Args:
         bvh: the hierarchy.
         fans: the rays; inactive ones meet nothing.
-        back_faces: from where on they stop rays.
-        seeds: of each direction, one a lane, no two rays' alike (:func:`ray_seeds`).
+        back_faces: the distance beyond which back faces stop rays.
+        seeds: of each direction, one per lane; every ray needs its own (:func:`ray_seeds`).
     """
     if dr.flag(dr.JitFlag.SymbolicScope):
         start = Stops.none(fans.active, seeds)
@@ -153,7 +153,7 @@ def _trace(
     line: Line,
     found: Sequence[FirstHit],
 ) -> Sequence[FirstHit]:
-    """Trace all fans; ``found`` receives what stops each ray."""
+    """Trace all fans; ``found`` receives the stop of each ray."""
 
     def begin(fan: mi.UInt32, going: mi.Bool) -> Stops:
         return Stops.none(
@@ -178,7 +178,7 @@ def _trace(
 
 @dataclass
 class Line:
-    """Fans that wait: their number and how many were taken, one lane each; ``lane`` counts those who take."""
+    """A queue of fans: their number and how many were taken, one lane each; ``lane`` numbers the takers."""
 
     lane: mi.UInt32
     fans: mi.UInt32
@@ -186,14 +186,14 @@ class Line:
 
     @staticmethod
     def of(count: int) -> Line:
-        """A line of ``count`` fans, none of them taken."""
+        """Queue ``count`` fans, none of them taken."""
         line = Line(dr.arange(mi.UInt32, count), dr.opaque(mi.UInt32, count), dr.opaque(mi.UInt32, 0))
         dr.make_opaque(line)
         return line
 
 
 def spread(values: Any, width: int) -> Any:
-    """``width`` numbers of each array in ``values``, which may be a tree: one for all is repeated."""
+    """Repeat arrays of one number to ``width`` numbers; ``values`` may be a tree of arrays."""
     if isinstance(values, Fans):
         return Fans(
             mi.Point3f(*[spread(dr.detach(v), width) for v in values.origin]),
@@ -218,19 +218,19 @@ def serve(
     ],
     write: Callable[[State, mi.UInt32, mi.Bool], None],
 ) -> State:
-    """Walk all fans of ``line``: many fans of rays for the lanes that trace them.
+    """Trace all fans of the queue ``line``; a lane may trace many of them.
 
-    Some fans pass twice as many nodes as their neighbours. With a lane for each, the lanes of a packet wait
-    for the slowest, and only 60 % of them work. Here a lane that is done takes the next fan in line, by a
-    counter that all lanes share, until none is left (persistent threads: Aila and Laine 2009). What a fan
-    finds is written at its own place, so the result does not depend on who traced it.
+    Some fans pass twice as many nodes as their neighbours. With one lane per fan, the lanes of a packet wait
+    for the slowest, and only 60 % of them work. Here a lane that is done takes the next fan from the queue,
+    by a counter that all lanes share, until none is left (persistent threads: Aila and Laine 2009). A fan's
+    result is written at its own place, so it does not depend on the lane that traced it.
 
     Args:
-        bvh: the hierarchy. fans: as many rays each as ``state`` has intervals. line: their line.
-        state: of a walk that is over.
-        begin: the state in which the walk of a fan begins, in the lanes given.
-        visitor: of the walk of a fan from its origin along its directions, of its surface's normal.
-        write: takes the state in which the walk of a fan ended, in the lanes given.
+        bvh: the hierarchy. fans: as many rays each as ``state`` has intervals. line: their queue.
+        state: of a finished walk.
+        begin: gives the initial state of a fan's walk, in the lanes given.
+        visitor: makes the visitor of a fan's walk from its origin, directions and surface normal.
+        write: stores the final state of a fan's walk, in the lanes given.
     """
     rays = range(len(fans.directions))
     fan, going = mi.UInt32(_NO_FAN), line.lane < line.fans
@@ -255,7 +255,7 @@ def serve(
 
 
 def queued_transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi.Float]:
-    """`tron.tracing.hierarchy.transmittance` of fans, at once; not inside a recorded loop."""
+    """`tron.tracing.hierarchy.transmittance` of all fans, evaluated at once; not for recorded loops."""
     count = dr.width(fans)
     fans = spread(fans, count)
     found = [dr.zeros(mi.Float, count) for _ in fans.directions]
@@ -264,13 +264,13 @@ def queued_transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi
     return [dr.select(lanes, value, 1) for value, lanes in zip(found, fans.active)]
 
 
-# Tracing the walk takes Python as long as tracing 10,000 rays takes a core, so it is recorded once for each
-# kind of arguments: kernel degree, levels, rays in a fan. Other sizes are free.
+# Python needs as long to trace this code as a core needs for 10,000 rays, so it is recorded once for each
+# kind of arguments: kernel degree, levels, rays per fan. Array sizes may change freely.
 @recorded
 def _products(
     bvh: Bvh, fans: Fans, back_faces: BackFaces, line: Line, found: Sequence[mi.Float]
 ) -> Sequence[mi.Float]:
-    """Trace all fans; ``found`` receives what is left of each ray."""
+    """Trace all fans; ``found`` receives each ray's transmittance."""
 
     def begin(fan: mi.UInt32, going: mi.Bool) -> Products:
         return Products.clear([dr.gather(mi.Bool, lanes, fan, going) for lanes in fans.active])

@@ -1,15 +1,15 @@
-"""Transmittance along arbitrary rays: a product over hits, so the order in which they are hit is free.
+"""Transmittance along arbitrary rays: a product over hits, independent of their order.
 
-Sidedness (conventions.md, 8): one-sided surfels leak, because undersides that no camera saw do not
-exist; naive two-sided surfels darken their own surface. So back faces block only beyond two surfel spacings,
-where they can no longer belong to the surface that the ray left. Where surfels are larger than the scene's
-median, their spacing is larger by as much (:class:`BackFaces`).
+Sidedness (conventions.md, 8): one-sided surfels leak light, because surfaces that no camera saw from below
+have no underside; naive two-sided surfels darken their own surface. So back faces block only beyond two
+surfel spacings, where they can no longer belong to the surface that the ray left. For a surfel larger than
+the scene's median, the spacing grows in proportion (:class:`BackFaces`).
 
-Front faces block from t = 0, but for those of a thin sheet's other side. Its surfels lie back to back with
-those that a ray leaves, and jitter puts some on the wrong side: the ray meets their front. They face against
-the surface that it leaves, and its origin is next to their plane: within half a spacing, such a
-front nearer than two along the ray does not block. Those spacings are the surfel's own, smaller where
-it is: fine things in a coarse scene have gaps of less than the scene's.
+Front faces block from t = 0, except on a thin sheet's other side. Its surfels lie back to back with those
+that a ray leaves, and jitter puts some on the wrong side, so that the ray meets their front. A front face
+does not block if it faces against the surface that the ray leaves, the ray's origin is within half a spacing
+of its plane, and the hit is nearer than two spacings. These are the surfel's own spacings, because fine
+objects in a coarse scene have gaps smaller than the scene's spacing.
 """
 
 from __future__ import annotations
@@ -26,12 +26,12 @@ from tron.tracing.hierarchy.traversal import any_of, walk
 from tron.tracing.kernel import GEOMETRY_PACKETS, RADIUS, SurfelHit, SurfelRecords, intersect
 
 OPAQUE_TRANSMITTANCE = 1e-2
-"""Below this a ray counts as blocked: the result is exactly 0, whatever the order of the hits was."""
+"""Below this a ray counts as blocked: the result is exactly 0 for any order of the hits."""
 BACK_FACE_SPACINGS = 2.0
 SHEET_SPACINGS = 0.5
-"""Distance of a ray's origin from the plane of a front face within which that may be a sheet's other side."""
+"""Largest distance of a ray's origin from the plane of a front face on a sheet's other side, spacings."""
 AGAINST = 0.7
-"""Least cosine, negated, between the normals of a sheet's sides."""
+"""Least negated cosine between the normals of a sheet's two sides."""
 
 
 @dataclass
@@ -39,10 +39,10 @@ class Fans:
     """Shadow rays, a fan of them from each origin.
 
     Attributes:
-        origin: world, one a lane.
-        directions: unit, world, of the rays that leave it: close to each other, for speed.
-        active: the lanes of each direction to trace; transmittance of the others is 1.
-        normal: unit, world, of the surface that they leave; 0 where they leave none.
+        origin: world, one per lane.
+        directions: unit, world, of the rays from the origin; close to each other, for speed.
+        active: for each direction, the lanes to trace; transmittance in the other lanes is 1.
+        normal: unit, world, of the surface that the rays leave; 0 if they leave none.
     """
 
     origin: mi.Point3f
@@ -53,7 +53,7 @@ class Fans:
 
 @dataclass
 class Products:
-    """Transmittance so far of each ray of a fan; a blocked ray's interval is empty."""
+    """Transmittance of each ray of a fan so far; a blocked ray's interval is empty."""
 
     product: list[mi.Float]
     nearest: list[mi.Float]
@@ -61,7 +61,7 @@ class Products:
 
     @staticmethod
     def clear(active: Sequence[mi.Bool]) -> Products:
-        """Nothing hit yet, by the rays that are traced."""
+        """Initial state of the rays to trace: nothing hit yet."""
         return Products(
             product=[mi.Float(1) for _ in active],
             nearest=[mi.Float(0) for _ in active],
@@ -71,12 +71,12 @@ class Products:
 
 @dataclass
 class BackFaces:
-    """From where on back faces block: one lane each.
+    """Distance from the ray's origin beyond which back faces block; one lane each.
 
     Attributes:
-        distance: from the ray's origin, world units, for surfels up to the median size.
-        radii: from the ray's origin, in radii of the surfel, for larger ones, and for a sheet's other side of
-            all; infinity in both for never.
+        distance: world units, for surfels up to the median size.
+        radii: in radii of the surfel, for larger surfels, and for the sheet rule of all surfels. Infinity in
+            both: back faces never block.
     """
 
     distance: mi.Float
@@ -84,12 +84,12 @@ class BackFaces:
 
     @staticmethod
     def never() -> BackFaces:
-        """Back faces that block nowhere: one-sided surfels."""
+        """Back faces never block: one-sided surfels."""
         return BackFaces(dr.opaque(mi.Float, dr.inf), dr.opaque(mi.Float, dr.inf))
 
     @staticmethod
     def of(records: SurfelRecords, spacing: float) -> BackFaces:
-        """Two spacings, which are ``spacing`` (world units) where surfels have their median size."""
+        """Back faces block beyond two spacings; ``spacing``, world units, is for surfels of median size."""
         radii = np.array(dr.detach(records.geometry)).reshape(-1, 4 * GEOMETRY_PACKETS)[:, RADIUS]
         median = float(np.median(radii[radii > 0])) if (radii > 0).any() else 1.0
         reach = BACK_FACE_SPACINGS * spacing
@@ -97,10 +97,10 @@ class BackFaces:
 
 
 def blocks(hit: SurfelHit, back_faces: BackFaces, normal: mi.Vector3f) -> mi.Bool:
-    """Whether a surfel stands in the ray's way: the rule of sidedness above; ``normal`` of :class:`Fans`."""
+    """Whether a surfel blocks the ray, by the rule of sidedness above; ``normal``: as in :class:`Fans`."""
     local = back_faces.radii * hit.radius
     far = dr.select(local > back_faces.distance, local, back_faces.distance)
-    # By squares, for a stored normal is not unit: the origin's distance from the plane, the angle between.
+    # Distance from the plane and angle, both squared, because stored normals are not of unit length.
     length2, aside, along = dr.squared_norm(hit.normal), hit.t * hit.facing, dr.dot(hit.normal, normal)
     sheet = SHEET_SPACINGS / BACK_FACE_SPACINGS * local
     other_side = (
@@ -111,7 +111,7 @@ def blocks(hit: SurfelHit, back_faces: BackFaces, normal: mi.Vector3f) -> mi.Boo
 
 
 def remaining(product: mi.Float) -> mi.Float:
-    """A ray's product, or exactly 0 where it counts as blocked."""
+    """A ray's product, or exactly 0 if it counts as blocked."""
     return dr.select(product >= OPAQUE_TRANSMITTANCE, product, 0)
 
 
@@ -122,7 +122,7 @@ def multiply(
     back_faces: BackFaces,
     normal: mi.Vector3f,
 ) -> Callable[[Products, mi.UInt32, mi.Bool], Products]:
-    """Visitor of a walk: multiplies by what each surfel lets through."""
+    """Visitor of a walk: multiply each ray's product by the surfel's 1 - alpha."""
 
     def visit(state: Products, surfel: mi.UInt32, _: mi.Bool) -> Products:
         for ray, direction in enumerate(directions):
@@ -139,7 +139,7 @@ def multiply(
 def transmittance(bvh: Bvh, fans: Fans, back_faces: BackFaces) -> list[mi.Float]:
     """Product of (1 - alpha) over the surfels that block each ray; exactly 0 below ``OPAQUE_TRANSMITTANCE``.
 
-    mi.Float in [0, 1] for each direction. Within recorded loops too; elsewhere
+    Returns mi.Float in [0, 1] for each direction. It works within recorded loops; elsewhere
     :func:`tron.tracing.hierarchy.first_hit.queued_transmittance` is faster.
     """
     visit = multiply(bvh, fans.origin, fans.directions, back_faces, fans.normal)

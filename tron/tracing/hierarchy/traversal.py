@@ -1,13 +1,13 @@
-"""The walk through the hierarchy, for whoever wants to visit the surfels near some rays, in any order.
+"""Traversal of the hierarchy: visit the surfels near some rays, in any order.
 
-A lane carries a fan of rays from one point. They share each node that is read, which is what a walk spends
-its time on: four rays of neighbouring directions together take little more than half the time of four alone.
+A lane carries a fan of rays from one point. They share each node read, which takes most of the time: four
+rays in neighbouring directions take little more than half as long as four single rays.
 
 No stack is kept: a word of four bits a level says which nodes are still to be visited (:class:`Descent`).
 
-Lanes look for leaves at their own pace but meet the surfels of leaves together: each lane collects leaves for
-a few steps, and then all meet the surfels of a few of theirs. One lane in a leaf would otherwise keep fifteen
-waiting at nearly every node (Aila and Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
+Lanes search for leaves independently but meet surfels together: each lane collects leaves for a few steps,
+and then all lanes meet the surfels of a few leaves. Otherwise one lane in a leaf would keep fifteen waiting
+at nearly every node (Aila and Laine 2009, "Understanding the Efficiency of Ray Traversal on GPUs").
 """
 
 from __future__ import annotations
@@ -26,18 +26,18 @@ LEAVES_A_TURN = 4
 _GROUPS = 3
 """Groups of leaves, each under one node, that a lane can hold."""
 _ROOT = 2
-"""Pending at first: child 1 of a node 0 that does not exist."""
+"""Initial value of ``pending``: the root is child 1 of a node 0 that does not exist."""
 _TINY = 1e-12
 _ROUNDING = 1 + 2.0**-21
 """Covers the float32 rounding of distances (Ize 2013, "Robust BVH Ray Traversal")."""
 
 
 class Intervals(Protocol):
-    """State of a walk: at least the distances between which surfels can still matter.
+    """State of a walk: at least the interval of distance within which surfels can still matter.
 
     Attributes:
-        nearest, farthest: one of each a ray, world units along the unit ray; a ray is done once farthest is
-            minus infinity, and the walk once all are.
+        nearest, farthest: one per ray, world units along the unit ray; a ray is done once farthest is minus
+            infinity, and the walk is done once all its rays are.
     """
 
     nearest: list[mi.Float]
@@ -56,7 +56,7 @@ def _larger(a: mi.Float, b: mi.Float) -> mi.Float:
 
 
 def any_of(masks: Sequence[mi.Bool]) -> mi.Bool:
-    """Lanes where one of the masks is set."""
+    """Lanes in which any of the masks is set."""
     found = mi.Bool(masks[0])
     for mask in masks[1:]:
         found = found | mask
@@ -71,8 +71,8 @@ class Descent:
         node: the node visited last.
         pending: nodes still to be visited, four bits a level: ``node``'s children lowest, then its siblings,
             and so on upwards. Seventeen levels fit.
-        groups: leaves found and not yet visited, last found first: the node above them, counted from the
-            first one above leaves, times 16, plus four bits for its children; 0 for none.
+        groups: leaves found but not yet visited, last found first: 16 times the number of their parent,
+            counted from the first parent of leaves, plus one bit for each child; 0 for none.
     """
 
     node: mi.UInt32
@@ -85,7 +85,7 @@ class Descent:
         return Descent(mi.UInt32(0), mi.UInt64(_ROOT), [mi.UInt32(0) for _ in range(_GROUPS)])
 
     def unfinished(self, state: Intervals) -> mi.Bool:
-        """Something is left to be visited, and a ray for which it matters."""
+        """Lanes with nodes left to visit and a ray that is not done."""
         return ((self.pending != 0) | (self.groups[0] != 0)) & any_of([f > -dr.inf for f in state.farthest])
 
 
@@ -108,7 +108,7 @@ def walk(
     Args:
         bvh: the hierarchy.
         origin: world, of all rays of a lane. directions: unit, world.
-        state: carried through the walk, which it may shorten by narrowing its intervals.
+        state: carried through the walk; narrowing its intervals shortens the walk.
         visit: called with the state, a surfel in the hierarchy's order, and the lanes that visit it.
         active: lanes that walk.
     """
@@ -131,7 +131,7 @@ def search(
     at: Descent,
     active: mi.Bool,
 ) -> Descent:
-    """Collect leaves, for ``NODES_A_TURN`` nodes or until a lane can hold no more."""
+    """Collect leaves, for ``NODES_A_TURN`` nodes or until a lane's slots are full."""
     passed = mi.UInt32(0)
     searching = active & (at.groups[-1] == 0) & (at.pending != 0)
     while searching:
@@ -182,7 +182,7 @@ def _met_children(
     state: Intervals,
     active: mi.Bool,
 ) -> mi.UInt32:
-    """Children whose boxes any ray of the fan meets within its interval: four bits."""
+    """Four bits: the children whose boxes a ray of the fan meets within its interval."""
     packets = [
         dr.gather(mi.Vector4u, bvh.nodes, node * NODE_PACKETS + packet, active)
         for packet in range(NODE_PACKETS)

@@ -1,1 +1,1 @@
-"""Camera rays along the lists of screen tiles."""
+"""Camera rays, traced through the candidate lists of screen tiles."""

@@ -1,8 +1,8 @@
-"""Exact compositing of any number of hits, some of the nearest at a time.
+"""Exact compositing of any number of hits, the K nearest at a time.
 
-Each round looks for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
-surfels are neither lost nor hit twice. Rays that no tile holds look for them in the hierarchy; the few camera
-rays that :mod:`tron.tracing.gbuffer` has no room for look in the list of their tile. Slower, but
+Each round searches for the K nearest hits behind the last one composited; (t, id) orders hits, so coincident
+surfels are neither lost nor hit twice. Arbitrary rays search the hierarchy. Camera rays with more hits than
+:mod:`tron.tracing.gbuffer` can hold, which are few, search the list of their tile. This is slower, but
 nothing overflows.
 """
 
@@ -27,7 +27,7 @@ _NO_ID = 0xFFFFFFFF
 Search: TypeAlias = "Callable[[_Nearest, mi.Bool], _Nearest]"
 """Fills the slots, in the lanes given, with the nearest hits behind (nearest, last)."""
 LISTED_IDS = 1 << 26
-"""Most ids for which there is memory at once, 4 bytes each; a single ray may need more."""
+"""Most ids held in memory at a time, 4 bytes each; a single ray may need more."""
 
 
 @dataclass
@@ -36,8 +36,8 @@ class _Nearest:
 
     Attributes:
         t, alpha: K of mi.Float; index: K of mi.UInt32, the scene's ids.
-        nearest, last: t and id of the last hit composited; nearest is a list of one, as walks have it.
-        farthest: t beyond which nothing is kept, a list of one: of the last slot, or where the ray ends.
+        nearest, last: t and id of the last hit composited; nearest is a list of one, as walks expect.
+        farthest: t beyond which nothing is kept, a list of one: the last slot's, or the end of the ray.
     """
 
     t: list[mi.Float]
@@ -49,7 +49,7 @@ class _Nearest:
 
     @staticmethod
     def behind(nearest: mi.Float, last: mi.UInt32) -> _Nearest:
-        """Nothing found yet behind the hit (nearest, last)."""
+        """Initial state: nothing found yet behind the hit (nearest, last)."""
         return _Nearest(
             t=[mi.Float(dr.inf) for _ in range(K)],
             index=[mi.UInt32(_NO_ID) for _ in range(K)],
@@ -62,7 +62,7 @@ class _Nearest:
 
 @dr.syntax
 def _insert(kept: _Nearest, hit: SurfelHit, index: mi.UInt32, active: mi.Bool) -> _Nearest:
-    """Keep a surfel that is hit, if it is among the nearest."""
+    """Keep a hit if it is among the nearest."""
     behind = (hit.t > kept.nearest[0]) | ((hit.t == kept.nearest[0]) & (index > kept.last))
     if active & hit.within & hit.front & behind & (hit.t <= kept.farthest[0]):
         t, alpha = hit.t, hit.alpha
@@ -82,7 +82,7 @@ def _insert(kept: _Nearest, hit: SurfelHit, index: mi.UInt32, active: mi.Bool) -
 
 
 def search_hierarchy(bvh: Bvh, origin: mi.Point3f, direction: mi.Vector3f) -> Search:
-    """Look for hits of any rays, unit directions, in the hierarchy."""
+    """Make a search for hits of arbitrary rays, unit directions, in the hierarchy."""
 
     def visit(kept: _Nearest, surfel: mi.UInt32, active: mi.Bool) -> _Nearest:
         hit = intersect(bvh.geometry, surfel, origin, direction, bvh.degree)
@@ -96,9 +96,9 @@ def search_list(
     records: SurfelRecords, entries: mi.UInt32, near: mi.Float, start: mi.UInt32, count: mi.UInt32,
     origin: mi.Point3f, direction: mi.Vector3f, limit: mi.Float, kept: _Nearest, active: mi.Bool,
 ) -> _Nearest:  # fmt: skip
-    """Look for hits of camera rays in their tiles' lists, up to the distance ``limit`` of each ray.
+    """Make a search for hits of camera rays in their tiles' lists, up to the distance ``limit`` of each ray.
 
-    Arguments before it as in ``hits.collect``.
+    Other arguments as in ``hits.collect``.
     """
     kept.farthest[0] = mi.Float(limit)
     cursor, end = mi.UInt32(start), start + count
@@ -125,7 +125,7 @@ def composite_rounds(
 
     Args:
         records: the surfels, in the scene's order.
-        search: where to look for hits.
+        search: finds the nearest hits.
         direction: of the rays, unit, world; SH is evaluated there.
         active: lanes to trace; the others meet nothing.
         out: receives the composited ids of lane r in list r, which must have room.
@@ -138,7 +138,7 @@ def composite_rounds(
     rows = None
     if dr.hint(out is not None, mode="scalar"):
         rows = out.rows()
-    nearest, last = mi.Float(T_MIN), mi.UInt32(_NO_ID)  # no id is larger: a hit at T_MIN itself is none
+    nearest, last = mi.Float(T_MIN), mi.UInt32(_NO_ID)  # the largest id: a hit at T_MIN itself does not count
     going = mi.Bool(active)
     while going:
         kept = search(_Nearest.behind(nearest, last), going)
@@ -158,13 +158,13 @@ def composite_rounds(
 class RelistedHits:
     """Lists of the hits of some rays; each iteration finds them again and yields them batch after batch.
 
-    The adjoint replays each ray's hits. Where many rays meet many surfels, their ids would need too much
-    memory between the forward and the backward pass; the backward pass composites such rays once more, in
-    batches. No dataclass, which Dr.Jit would take apart and put together again.
+    The adjoint replays each ray's hits. If many rays meet many surfels, keeping their ids from the forward to
+    the backward pass would take too much memory; the backward pass composites such rays again, in batches.
+    Not a dataclass, because Dr.Jit would traverse and rebuild it.
 
     Args:
         records: the surfels, detached.
-        search: lanes of ``ray`` (mi.UInt32) -> where to look for the hits of these.
+        search: lanes of ``ray`` (mi.UInt32) -> the search for these rays' hits.
         direction: of the rays in ``ray``, unit, world.
         ray: mi.UInt32, the ray that each lane belongs to.
         count: mi.UInt32, composited hits of each lane, evaluated.
@@ -195,5 +195,5 @@ class RelistedHits:
 
 
 def lanes_of(values: Any, lane: mi.UInt32) -> Any:
-    """Some lanes of ``values``, which may be one for all."""
+    """Gather some lanes of ``values``, which may be one number for all."""
     return values if dr.width(values) == 1 else dr.gather(type(values), values, lane)

@@ -1,20 +1,20 @@
-"""Splats as a camera of their own viewer sees them: disks parallel to the image plane.
+"""Splats projected as in their own viewers: disks parallel to the image plane.
 
 A splat of 3DGS is drawn as the Gaussian that its covariance projects to (Zwicker et al. 2001, EWA splatting;
-Kerbl et al. 2023), in the order of centres' depths. The same picture comes of a disk through the centre that
-is parallel to the image plane: rays meet all points of it at one depth. With a, b and c the splat's two axes
-and its thickness projected into the plane at distance 1, by the Jacobian of the projection at its centre, k
-the pixel variance in that plane, and L = a_y^2 + b_y^2 + c_y^2,
+Kerbl et al. 2023), in the order of centres' depths. A disk through the centre parallel to the image plane
+gives the same picture: rays meet all its points at one depth. With a, b and c the splat's two axes and its
+thickness projected into the plane at distance 1, by the Jacobian of the projection at its centre, k the pixel
+variance in that plane, and L = a_y^2 + b_y^2 + c_y^2,
 
     A = a_x^2 + b_x^2 + c_x^2 + k_x    B = a_x a_y + b_x b_y + c_x c_y
     D = (a x b)^2 + (b x c)^2 + (c x a)^2 + k_x L + k_y A
     q = X^2 / A + (Y - X B / A)^2 A / D
 
-are the covariance's first row, its determinant without a difference of large numbers, which needles would
-lose, and the distance of a point (X, Y) from the centre. Its two squares are the coordinates that a record
-stands for. The median depth is not that of such a disk: :mod:`tron.tracing.surface`.
+A and B are the covariance's first row. D is its determinant, without a difference of large numbers, which is
+inaccurate for needles. q is the squared distance of a point (X, Y) from the centre, u^2 + v^2 of the record.
+The median depth does not come from this disk: :mod:`tron.tracing.surface`.
 
-2DGS's splats stay disks in space, met at the same depths, with a pixel's filter about their centres
+Splats of 2DGS stay disks in space, with a pixel's filter about their centres at their centres' depths
 (:func:`tron.tracing.kernel.intersect`).
 """
 
@@ -39,30 +39,30 @@ from tron.tracing.kernel import (
 from tron.tracing.parameters import interleave
 
 NEAREST = 0.2
-"""Depth of a centre from which a splat is seen, world units, as in 3DGS."""
+"""Least depth of the centre of a visible splat, world units, as in 3DGS."""
 NEAREST_SPACINGS = 20.0
-"""The same in spacings of splats, which counts where it is less: of scans in other units than 3DGS's."""
+"""Least depth in spacings of splats; the smaller of the two counts, for scans in other units than 3DGS's."""
 _OUTSIDE = 1.3
-"""Times the image's half width beyond which the projection is not bent further, as in 3DGS."""
+"""Times the image's half width at which the projection's Jacobian is clamped, as in 3DGS."""
 _LARGEST = 1e3
-"""Deviation that no splat exceeds, in depths: it covers every picture, and squares stay finite."""
+"""Largest deviation of a splat, in depths: it covers every picture, and squares stay finite."""
 _LEAST_KEPT = 2.5e-5
-"""Least share of a determinant that compensation counts, as in 3DGS."""
+"""Least ratio of determinants that compensation uses, as in 3DGS."""
 _AWAY = 1e-3
-"""Cosine up to which a splat that is seen edge on is not taken for one that looks away."""
+"""Cosine up to which a splat seen edge on still counts as facing the camera."""
 
 
 def projected(
     records: SurfelRecords, camera: Camera, projection: Projection, nearest: float, thickness: mi.Float
 ) -> SurfelRecords:
-    """The surfels as disks that a camera sees as their projections, coloured as seen along their centres.
+    """Turn surfels into disks that show their projections, with SH colour evaluated towards their centres.
 
     Differentiable in the records; the thickness is a constant.
 
     Args:
         records: disks in space. camera: the view.
-        projection: of the program that the splats were learnt with.
-        nearest: least depth of a centre that is seen, world units.
+        projection: of the program that trained the splats.
+        nearest: least depth of the centre of a visible splat, world units.
         thickness: deviations along the normals, world units; disks of 2DGS have none.
     """
     eye = mi.Point3f([float(v) for v in camera.position])
@@ -86,7 +86,7 @@ def projected(
     normal = dr.normalize(dr.cross(dr.normalize(u_axis), dr.normalize(v_axis)))
     seen &= ~(dr.dot(normal, dr.normalize(to_centre)) > _AWAY)
     z, opacity, pixel = dr.select(seen, depth, 1), centre.w, None
-    if projection.larger:  # round: pixels that are not square are taken for squares as large
+    if projection.larger:  # the filter is round: as of a square pixel of equal area
         along, across, pixel = u_axis, v_axis, forward * dr.sqrt(dr.sqrt(variance_x * variance_y))
         wide = dr.rcp(dr.squared_norm(u_axis)) + dr.rcp(dr.squared_norm(v_axis))
     else:

@@ -1,10 +1,10 @@
 """Screen tiles: which surfels can touch which 4x4 block of pixels, nearest first.
 
 A tile's 16 pixels fill one 16-lane packet, so every lane of a packet walks the same list. A surfel is a
-candidate for a tile where the exact screen-space bounds of its (cut) ellipse, across, down and along both
-diagonals, overlap the tile's pixel centres; of one that crosses the camera's plane, the bounds of the part in
-front. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the surfel,
-which lets traversal stop early without being wrong.
+candidate for a tile if the exact screen-space bounds of its (cut) ellipse, across, down and along both
+diagonals, overlap the tile's pixel centres; if it crosses the camera's plane, only the part in front is
+bounded. Lists are sorted by ``near = |c - o| - r``, a lower bound of the distance to any point of the surfel,
+so that traversal can stop early and stay exact.
 
 Surfels are ordered by ``near`` first and written out tile by tile, so one stable sort by tile orders both.
 All of it runs in Dr.Jit; only the number of entries comes back to Python, because arrays need a size.
@@ -24,16 +24,16 @@ from tron.tracing.kernel import GEOMETRY_PACKETS, T_MIN, SurfelRecords, half_axe
 TILE = 4
 LANES = TILE * TILE
 MARGIN = 1e-2
-"""Pixels added around a surfel's bounds: candidates may be too many by rounding, never too few."""
+"""Pixels added around a surfel's bounds, so that rounding adds candidates but never loses one."""
 TOUCHING = 1e-4
-"""Nearest depth of an ellipse as a share of its farthest; below it, the farther bound is none."""
+"""Nearest depth of an ellipse as a share of its farthest; below it, its farther bound is infinite."""
 ROUNDING = 1e-6
-"""Some units in the last place of a float32, by which bounds are widened."""
+"""Relative widening of bounds: some units in the last place of a float32."""
 MOST_ENTRIES = 1 << 25
-"""Entries of one list that are made at once: 50 bytes each, 1.7 GB."""
+"""Most entries of the lists made at once: 50 bytes each, 1.7 GB."""
 TINY = 1e-30
 SLACK = 0.9999
-"""Bounds of t are less by rounding than a ray's own t, which may be ill-conditioned."""
+"""Factor on lower bounds of t, because a ray's own t may be rounded down."""
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ class _Touched:
     Attributes:
         first_x, across, first_y: first tile, number of tiles across, first tile down. count: of them all.
         diagonals: mi.Float, four a surfel: lowest and highest pixel x + y, lowest and highest x - y.
-        planes: mi.Float, four a surfel: its normal in camera space, and the camera's height over its plane.
+        planes: mi.Float, four a surfel: its normal in camera space and the camera's height above its plane.
         near, far: bounds of the distance to any point of the surfel.
     """
 
@@ -101,7 +101,7 @@ class _Touched:
 
 
 class TooManyEntries(TronError):
-    """Lists of a camera's tiles would be longer than was asked for."""
+    """A camera's tile lists would exceed the allowed number of entries."""
 
 
 def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 1) -> TileLists:
@@ -109,10 +109,10 @@ def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 
 
     Args:
         records: the surfels. camera: the view.
-        most: entries, at most what 32-bit indices can address.
+        most: largest number of entries, at most what 32-bit indices can address.
 
     Raises:
-        TooManyEntries: there are more.
+        TooManyEntries: the lists would have more.
     """
     tiles_x, tiles_y = tile_counts(camera.width, camera.height)
     bounds = _touched_tiles(records, camera)
@@ -143,7 +143,7 @@ def build_tiles(records: SurfelRecords, camera: Camera, most: int = (1 << 32) - 
     if dr.width(kept) == 0:
         return _no_lists(tiles_x * tiles_y)
     tile, surfel = dr.gather(mi.UInt32, tile, kept), dr.gather(mi.UInt32, surfel, kept)
-    # One sort orders tiles and, within each, bounds, which take what bits of a key the tiles leave.
+    # One sort orders by tile, then by bound; the bound takes the bits of a key that the tile leaves free.
     levels = min((1 << 32) // (tiles_x * tiles_y), 1 << 31)
     scale = _Levels.of(dr.gather(mi.Float, near, kept), levels)
     levels = dr.opaque(mi.UInt32, levels)
@@ -202,7 +202,7 @@ def _touched_tiles(records: SurfelRecords, camera: Camera) -> _Touched:
     height = dr.abs(dr.dot(normal, mi.Vector3f(c.x / fx, c.y / fy, c.z)))
     height = dr.maximum(height - ROUNDING * distance, 0)
     near, far = distance - axis_u.w, distance + axis_u.w
-    if records.pixel is not None:  # each is met at the depth of its centre
+    if records.pixel is not None:  # each disk is met at the depth of its centre
         normal, height = mi.Vector3f(0, 0, -1), c.z
         near, far = dr.zeros(mi.Float, records.count), dr.full(mi.Float, dr.inf, records.count)
     planes = dr.zeros(mi.Float, 4 * records.count)
@@ -234,9 +234,9 @@ def _screen_bounds(
 
         (c_z - a_z) h d^2 - 2 e h d - b_x^2 = 0.
 
-    If all of the disk is in front, the roots have opposite signs and are the bounds. One that crosses the
-    camera's plane shows as one branch of a hyperbola: the root on the side of m away from e is a bound and
-    there is no other; or, where there are no roots, it surrounds the axis and has none.
+    If all of the disk is in front, the roots have opposite signs and are the bounds. A disk that crosses the
+    camera's plane projects to one branch of a hyperbola: the root on the side of m away from e is its only
+    bound; without roots, it surrounds the axis and is unbounded.
     """
     longest = dr.sqrt(a.z * a.z + b.z * b.z)
     tilted = longest > 0
@@ -250,7 +250,7 @@ def _screen_bounds(
     reach = dr.abs(e) * ahead + dr.sqrt(dr.maximum(squared, 0))
     rounding = ROUNDING * (dr.abs(c_x) + dr.abs(a_x) + dr.abs(m) * (dr.abs(c.z) + longest)) / ahead
     near = rounding + dr.select(squared >= 0, b_x * b_x / dr.maximum(reach, TINY), dr.inf)
-    # Where the ellipse all but touches the camera's plane this root is ill-conditioned, and far out anyway.
+    # If the ellipse nearly touches the camera's plane, this root is ill-conditioned, and far outside anyway.
     far = reach / (behind * ahead) * (1 + ROUNDING * ahead / behind)
     far = rounding + dr.select(behind > TOUCHING * ahead, far, dr.inf)
     low, high = m - dr.select(e > 0, near, far), m + dr.select(e > 0, far, near)
@@ -267,7 +267,7 @@ def _tile_range(low: mi.Float, high: mi.Float, pixels: mi.Float) -> tuple[mi.UIn
 
 
 def _meets_diagonals(bounds: mi.Vector4f, x: mi.UInt32, y: mi.UInt32) -> mi.Bool:
-    """Whether pixel centres of tile (x, y) lie within bounds of pixel x + y and x - y: cuts corners off."""
+    """Whether pixel centres of tile (x, y) lie within bounds of x + y and x - y, which cuts corners off."""
     left, top, reach = mi.Float(x * TILE) + TILE / 2, mi.Float(y * TILE) + TILE / 2, TILE - 1 + 2 * MARGIN
     falling, rising = left + top, left - top
     return (
@@ -283,7 +283,7 @@ def _near_in_tile(
 ) -> mi.Float:
     """Lower bound of t at which rays of tile (x, y) meet the front of a surfel.
 
-    With unit normal n and height h over the plane, a pixel's ray ``d = (d_x, d_y, 1)`` meets it at depth
+    With unit normal n and height h above the plane, a pixel's ray ``d = (d_x, d_y, 1)`` meets it at depth
     ``h / -(n . d)``. The denominator is linear in the pixel, so its maximum lies at a corner of the tile.
     """
     fx, fy, cx, cy = _opaque(camera.fx, camera.fy, camera.cx, camera.cy)
@@ -300,10 +300,10 @@ def _near_in_tile(
 
 @dataclass
 class _Levels:
-    """Positive numbers as few integers: the leading bits of a float above the smallest, rounded down.
+    """Quantise positive floats to few integers: the leading bits above the smallest float's, rounded down.
 
     Attributes:
-        lowest: mi.UInt32, bits of the smallest number. shift: mi.UInt32, how many of the last are left out.
+        lowest: mi.UInt32, bits of the smallest number. shift: mi.UInt32, how many low bits are dropped.
     """
 
     lowest: mi.UInt32
@@ -311,7 +311,7 @@ class _Levels:
 
     @staticmethod
     def of(numbers: mi.Float, levels: int) -> _Levels:
-        """For ``numbers`` (positive floats are ordered as their bits are), so that ``levels`` are enough."""
+        """At most ``levels`` levels for ``numbers``; positive floats are ordered like their bits."""
         bits = dr.reinterpret_array(mi.UInt32, numbers)
         lowest, highest = dr.min(bits), dr.max(bits)
         dr.eval(lowest, highest)
@@ -321,11 +321,11 @@ class _Levels:
         return _Levels(lowest, shift)
 
     def level(self, numbers: mi.Float) -> mi.UInt32:
-        """The integer of each number, no more than it."""
+        """The level of each number, rounded down."""
         return (dr.reinterpret_array(mi.UInt32, numbers) - self.lowest) >> self.shift
 
     def near(self, level: mi.UInt32) -> mi.Float:
-        """The smallest number of each integer."""
+        """The smallest number of each level."""
         return dr.reinterpret_array(mi.Float, (level << self.shift) + self.lowest)
 
 
