@@ -121,6 +121,7 @@ cli = command(
     examples=(
         "tron-bake scene=surfels.ply environment=studio.hdr output=relit.ply",
         "tron-bake scene=scan.ply environment=sunset.hdr rotation=90 up=[0,0,1] output=evening.ply",
+        "tron-bake scene=scan.ply environment=studio.hdr surroundings=keep look=none output=plain.spz",
     ),
     ended="no file was written; materials and a proxy that were found for a scan are kept",
 )

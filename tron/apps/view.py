@@ -137,6 +137,7 @@ cli = command(
     examples=(
         "tron-view scene=surfels.ply environments=hdris",
         "tron-view scene=scan.ply environments=studio.hdr models=things port=8090",
+        "tron-view scene=scan.ply environments=hdris materials=auto up=[0,0,1]",
     ),
     ended="what was saved is kept",
 )

@@ -1,6 +1,5 @@
 """What `--help` prints: a page to read, with `all` every key, recipe and option, with a NAME one of them."""
 
-import re
 import shutil
 import textwrap
 import types
@@ -74,19 +73,19 @@ class HelpPage:
         """What people read first: what the command does, what they set most, three examples."""
         page = [*_reflow(self.purpose.split("\n\n")[0], self.width), "", self._usage, ""]
         page.append("settings most used (default); --help all: the others; --help NAME: all about one")
-        for key, field, default in _fields(self.settings, self.defaults):
-            if key in self.shown:
-                kind = describe_type(field.annotation, looked_up=False)
-                page.append(_shorten(f"  {key}={_yaml(default)}   [{kind}]", self.width))
-                said = re.split(r"[;.:] ", field.description or "")[0]
-                page.append(_shorten(f"      {said}", self.width))
+        fields = {key: rest for key, *rest in _fields(self.settings, self.defaults)}
+        for key in self.shown:
+            field, default = fields[key]
+            kind = describe_type(field.annotation, looked_up=False)
+            page.append(_shorten(f"  {key}={_yaml(default)}   [{kind}]", self.width))
+            page += _described(field, self.width, max_lines=2, placeholder=" ...")
         for group, options in self.groups.items():
             if group == self.listed:
                 page += ["", f"{group}=NAME"]
                 gap = max(map(len, options)) + 4
-                page += [
-                    _shorten(f"  {each}".ljust(gap) + said, self.width) for each, said in options.items()
-                ]
+                for option, said in options.items():
+                    line = f"  {option}".ljust(gap) + said
+                    page += textwrap.wrap(line, self.width, max_lines=1, placeholder=" ...")
             else:
                 indent = {"initial_indent": f"{group}=NAME   ", "subsequent_indent": "    "}
                 page += ["", *textwrap.wrap(", ".join(options), self.width, **indent)]
@@ -186,11 +185,15 @@ def _entry(key: str, field: FieldInfo, default: Any, width: int) -> list[str]:
     else:
         shown = "" if default is NO_DEFAULT else f"={_yaml(default)}"
         lines = [_shorten(f"  {key}{shown}   [{describe_type(field.annotation)}]", width)]
-    indent = " " * 6
-    lines += textwrap.wrap(field.description or "", width, initial_indent=indent, subsequent_indent=indent)
+    lines += _described(field, width)
     inside = leaves(default) if isinstance(default, Mapping) else {}
     shown = [(name, value) for name, value in inside.items() if name.rpartition(".")[2] != "_target_"]
     return lines + [_shorten(f"    {key}.{name}={_yaml(value)}", width) for name, value in shown]
+
+
+def _described(field: FieldInfo, width: int, **at_most: Any) -> list[str]:
+    text, indent = field.description or "", " " * 6
+    return textwrap.wrap(text, width, initial_indent=indent, subsequent_indent=indent, **at_most)
 
 
 def _yaml(value: Any) -> str:
