@@ -54,8 +54,9 @@ class CaptureFormat:
 
 def _format(holds: str, module: str, detect: str, read: str, files: tuple[str, ...] = ()) -> CaptureFormat:
     """A row of functions of a module of this package, which is imported once one of them is called."""
-    home = f"tron.captures.{module}"
-    return CaptureFormat(holds, later(home, detect), later(home, read), files)
+    return CaptureFormat(
+        holds, later(f"tron.captures.{module}", detect), later(f"tron.captures.{module}", read), files
+    )
 
 
 FORMATS = {

@@ -87,8 +87,8 @@ class HelpPage:
                     line = f"  {option}".ljust(gap) + said
                     page += textwrap.wrap(line, self.width, max_lines=1, placeholder=" ...")
             else:
-                indent = {"initial_indent": f"{group}=NAME   ", "subsequent_indent": "    "}
-                page += ["", *textwrap.wrap(", ".join(options), self.width, **indent)]
+                line = f"{group}=NAME   {', '.join(options)}"
+                page += ["", *textwrap.wrap(line, self.width, subsequent_indent="    ")]
         return self._joined([*page, "", "examples", *(f"  {each}" for each in self.examples[:3])])
 
     def whole(self) -> str:
