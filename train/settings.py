@@ -248,7 +248,7 @@ class Settings(BaseModel):
         ge=1,
         description="Number of machines; start the command on each, by torchrun or srun.",
     )
-    precision: Precision = Field(default="32-true", description="Precision of training, in Lightning's words.")
+    precision: Precision = Field(default="32-true", description="Precision of training, as Lightning has it")
     strategy: Literal["auto", "ddp", "fsdp"] = Field(
         default="auto",
         description="How processes share the work: ddp (auto means this) keeps all weights in each; fsdp "
