@@ -1,4 +1,4 @@
-"""Seconds that a scene takes, stage by stage; no file whose bytes are promised holds them."""
+"""Seconds per stage of making a scene; files with promised bytes do not contain them."""
 
 from __future__ import annotations
 
@@ -13,7 +13,7 @@ REST = "rest"
 
 
 class Clock:
-    """Wall time of one piece of work; what is in an inner stage does not count to the outer.
+    """Wall time of one piece of work; time in an inner stage does not count for the outer one.
 
     Attributes:
         seconds: of each stage so far, and REST.
@@ -24,7 +24,7 @@ class Clock:
         self._stage, self._since = REST, time.perf_counter()
 
     def enter(self, stage: str) -> str:
-        """Go over to a stage; returns the one that ran until now."""
+        """Switch to a stage; return the previous one."""
         now = time.perf_counter()
         self.seconds[self._stage] += now - self._since
         before, self._stage, self._since = self._stage, stage, now
@@ -36,7 +36,7 @@ _running: ContextVar[Clock | None] = ContextVar("clock", default=None)
 
 @contextmanager
 def clocked() -> Iterator[dict[str, float]]:
-    """Stage -> seconds of what the block does; filled in when the block ends, however it ends."""
+    """Yield stage -> seconds of the block, filled in when the block ends, in any way."""
     clock, seconds = Clock(), dict[str, float]()
     token = _running.set(clock)
     try:
@@ -49,7 +49,7 @@ def clocked() -> Iterator[dict[str, float]]:
 
 @contextmanager
 def stage(name: str) -> Iterator[None]:
-    """A stage of the work that is clocked, as a block or around a function; nothing where none is."""
+    """Time a block or function as a stage of the clocked work; without a clock, do nothing."""
     clock = _running.get()
     if clock is None:
         yield

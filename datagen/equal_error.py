@@ -1,12 +1,12 @@
-"""Time that Mitsuba's path tracer takes to be as near the truth as guidance is.
+"""Time of Mitsuba's path tracer to reach the error of guidance.
 
-The truth of a frame is what the path tracer converges to. Its error and ours are root mean squares of what is
-seen: after exposure and AgX, over the pixels whose centre meets the scene. The path tracer is given more and
-more paths until its error is ours; between two numbers of paths error and time are taken as powers of their
-number. Its samples are the data engine's, stratified over pixel, light and lobe, and the same kernels serve
-every number of paths. Both take turns on one machine, in one process.
+The truth of a frame is what the path tracer converges to. Its error and ours are RMS errors of display
+values, after exposure and AgX, over pixels whose centre hits the scene. The path tracer gets more and more
+samples until its error equals ours; between two measured numbers of samples, error and time are interpolated
+as powers of the number. Samples are the data engine's, stratified over pixel, light and lobe, and the same
+kernels serve every number. Both take turns on one machine, in one process.
 
-What the truth itself is off by, known from its two halves, is taken off both squared errors.
+The error of the truth itself, estimated from its two halves, is subtracted from both squared errors.
 """
 
 from __future__ import annotations
@@ -92,7 +92,7 @@ def _surfels(settings: Settings, item: Work) -> Path:
 def _judge_scene(
     spec: SceneSpec, geometry: Geometry, scene: GaussianScene, settings: Settings
 ) -> list[dict[str, Any]]:
-    """A case for each light of the scene."""
+    """Return a case for each light of the scene."""
     recipe, wanted = settings.split(spec.split), settings.equal_error
     relighter = Relighter(scene, proxy="never")
     copy(relighter).prepare()  # compiles it
@@ -144,12 +144,12 @@ class _Frame:
         return to_display(image, self._environment.exposure())
 
     def _error(self, image: np.ndarray) -> float:
-        """Root mean square of what is seen, over the pixels that meet the scene."""
+        """Return the RMS error of display values over pixels that hit the scene."""
         off = (self._shown(image) - self._shown(self._truth))[self._inside].astype(np.float64)
         return math.sqrt(max((off**2).mean() - self._noise, 1e-12))
 
     def judge(self, relighter: Relighter, pictures: Path) -> dict[str, Any]:
-        """Times and errors of our frames, and of the path tracer's as far as they are wanted."""
+        """Measure times and errors of our frames, and of the path tracer's as far as needed."""
         lighting = Lighting(self._environment)
 
         def bake() -> BouncedLight | None:
@@ -205,10 +205,10 @@ class _Frame:
 
 
 def equal(by_paths: Mapping[int, tuple[float, float]], error: float) -> tuple[float, float]:
-    """Paths a pixel, and their seconds, at which the path tracer's error is ``error``.
+    """Return the samples per pixel, and their seconds, at which the path tracer's error is ``error``.
 
-    Powers between two measured numbers of paths, and beyond the last: there its error falls as of the last
-    two. Never fewer than the least measured.
+    Between two measured numbers of samples the error is a power law, and beyond the last it falls as between
+    the last two. The result is never below the least measured number.
 
     Args:
         by_paths: number of paths -> (error, seconds).
@@ -225,7 +225,7 @@ def equal(by_paths: Mapping[int, tuple[float, float]], error: float) -> tuple[fl
 
 
 def timed(work: Callable[[], Any]) -> tuple[Any, float]:
-    """Result of ``work``, evaluated, and the seconds that it took."""
+    """Return the evaluated result of ``work``, and its seconds."""
     import drjit as dr
 
     dr.sync_thread()

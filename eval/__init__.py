@@ -1,7 +1,7 @@
-"""Benchmarks of TRON and their reports (`tron-eval`): what was measured, against what, and how to see it.
+"""Benchmarks of TRON and their reports (`tron-eval`): each figure with its reference and its pictures.
 
-A benchmark is one file of :mod:`eval.benchmark`; it returns rows (:mod:`eval.results`), curves and
-pictures, of which one template of :mod:`eval.report` makes a page. Nothing here trains or makes data sets:
+A benchmark is a class of :mod:`eval.benchmark`; it returns rows (:mod:`eval.results`), curves and
+pictures, and a template of :mod:`eval.report` makes a page from them. Nothing here trains or makes data sets:
 data and weights come from disk, or from the other console commands. The tracer's own benchmark traces
 (:mod:`eval.tracing`).
 """

@@ -1,9 +1,9 @@
-"""Benchmark `ablations`: what each choice is worth, one at a time, and what it looks like.
+"""Benchmark `ablations`: change one choice at a time, and score and show the result.
 
 Choices of the renderer are made on small worlds of surfels (:mod:`eval.applications.worlds`), whose true
 meshes Mitsuba path-traces under the same light: rays, surfels, bounces, sub-pixels, seeds, networks, and the
-weights of the paper's two latents. What surfels are made from, and by which prior, is judged on a capture
-under lights that its photos never saw; how latents are fused, by trainings that differ in nothing else.
+weights of the paper's two latents. The source of surfels and the prior are judged on a capture under lights
+that its photos never saw. Fusions of latents are judged by trainings that differ in the fusion alone.
 """
 
 from __future__ import annotations
@@ -63,30 +63,32 @@ class Choice(NamedTuple):
 
 
 class Ablations(Benchmark):
-    """Parts and sizes; captures and trainings that are finished are not made again."""
+    """Settings: parts and sizes; finished captures and trainings are reused."""
 
     name: ClassVar[str] = "ablations"
 
-    parts: list[Part] = Field(description="what is varied", min_length=1)
+    parts: list[Part] = Field(description="choices to vary", min_length=1)
     renderer: Path | list[Path] | None = Field(
-        default=None, description="weights of networks, or shipped names; null: both that are shipped"
+        default=None, description="weights of networks, or names of shipped ones; null: both shipped networks"
     )
     seed: int = 0
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
-    threads: PositiveInt | None = Field(default=None, description="of Dr.Jit; null: one a core")
-    worlds: PositiveInt = Field(default=3, description="scenes, each under another kind of light")
-    width: PositiveInt = Field(default=192, description="of the square frames")
-    path_spp: PositiveInt = Field(default=256, description="paths a pixel of the truth")
-    rays: list[Annotated[int, Field(ge=2, multiple_of=2)]] = Field(description="shadow rays a pixel")
-    surfels: list[PositiveInt] = Field(description="numbers of surfels")
-    usual: PositiveInt = Field(default=50_000, description="surfels where something else is varied")
-    seeds: PositiveInt = Field(default=4, description="seeds of the rays")
-    captures: list[str] = Field(description="arguments of tron-datagen: captures, relit under other lights")
-    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for every prior")
-    priors: dict[Name, list[str]] = Field(description="further ones of each prior")
-    dataset: list[str] = Field(description="arguments of tron-datagen: what the fusions are trained on")
-    train: list[str] = Field(description="arguments of tron-train for every fusion")
-    fusions: dict[Name, list[str]] = Field(description="further ones of each fusion")
+    threads: PositiveInt | None = Field(default=None, description="threads of Dr.Jit; null: one per core")
+    worlds: PositiveInt = Field(default=3, description="number of scenes, each under another kind of light")
+    width: PositiveInt = Field(default=192, description="width of the square frames, pixels")
+    path_spp: PositiveInt = Field(default=256, description="path-traced samples per pixel of the truth")
+    rays: list[Annotated[int, Field(ge=2, multiple_of=2)]] = Field(
+        description="numbers of shadow rays per pixel to compare"
+    )
+    surfels: list[PositiveInt] = Field(description="numbers of surfels to compare")
+    usual: PositiveInt = Field(default=50_000, description="number of surfels while another choice is varied")
+    seeds: PositiveInt = Field(default=4, description="number of ray seeds to compare")
+    captures: list[str] = Field(description="arguments of tron-datagen that make captures and relight them")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct, the same for every prior")
+    priors: dict[Name, list[str]] = Field(description="prior -> further arguments of tron-reconstruct")
+    dataset: list[str] = Field(description="arguments of tron-datagen that make the fusions' training data")
+    train: list[str] = Field(description="arguments of tron-train, the same for every fusion")
+    fusions: dict[Name, list[str]] = Field(description="fusion -> further arguments of tron-train")
 
     def check(self) -> None:
         """Find the checkpoints, and the commands that the parts call."""
@@ -100,7 +102,7 @@ class Ablations(Benchmark):
                 script_path(each)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Vary part after part; one line on stderr for each figure.
+        """Vary the choices part by part; write one line per figure to stderr.
 
         Raises:
             StageFailed: a command failed.
@@ -123,7 +125,7 @@ class Ablations(Benchmark):
 
 @dataclass(frozen=True, eq=False)
 class Judged:
-    """A world's frame, its truth (H, W, 3) in display values, exposure, and where surfaces are seen."""
+    """A world's frame: its truth (H, W, 3) in display values, its exposure, and the mask of surfaces."""
 
     world: World
     camera: Camera
@@ -132,12 +134,12 @@ class Judged:
     inside: np.ndarray
 
     def psnr(self, shown: np.ndarray) -> float:
-        """Of display values, on surfaces, dB."""
+        """Return the PSNR of display values on surfaces, dB."""
         return capped_psnr(shown, self.truth, self.inside)
 
 
 class Run:
-    """Parts by name."""
+    """One method for each part of the benchmark."""
 
     def __init__(self, settings: Ablations, folder: Path):
         self.settings, self.folder = settings, folder
@@ -160,11 +162,11 @@ class Run:
 
     @cached_property
     def networks(self) -> dict[str, Network]:
-        """The checkpoints by their names among the methods."""
+        """The checkpoints, by method name."""
         return load_networks("neural", self.settings._weights())
 
     def rays(self) -> None:
-        """Shadow rays a pixel."""
+        """Vary the number of shadow rays per pixel."""
         usual = self.settings.usual
         choices = {
             str(rays): Choice(usual, FINAL.model_copy(update={"rays": rays}), 0)
@@ -173,18 +175,18 @@ class Run:
         self._vary("rays", choices, "{} rays")
 
     def surfels(self) -> None:
-        """Surfels of a scene."""
+        """Vary the number of surfels of a scene."""
         self._vary("surfels", {str(n): Choice(n, FINAL, 0) for n in self.settings.surfels}, "{} surfels")
 
     def bounces(self) -> None:
-        """Light with and without bounces."""
+        """Compare light with and without bounces."""
         found = {
             str(n): Choice(self.settings.usual, FINAL.model_copy(update={"bounces": n}), 0) for n in (0, 1, 4)
         }
         self._vary("bounces", found, "{} bounces")
 
     def supersampling(self) -> None:
-        """One sample a pixel, and four of a quarter of the rays each."""
+        """Compare one sample per pixel with four samples that have a quarter of the rays each."""
         found = {
             str(n**2): Choice(self.settings.usual, FINAL.model_copy(update={"supersample": n}), 0)
             for n in (1, 2)
@@ -192,14 +194,14 @@ class Run:
         self._vary("supersampling", found, "{} a pixel")
 
     def seeds(self) -> None:
-        """Rays of other seeds: the least and the greatest of them is what chance makes."""
+        """Vary the seed of the rays: the range of the figures is the spread due to chance."""
         choices = {str(n): Choice(self.settings.usual, FINAL, n) for n in range(self.settings.seeds)}
         means = self._vary("seeds", choices, "seed {}")
         spread = max(means) - min(means)
         self.outcome.add([Row(metric="seeds.spread_db", value=spread, unit="dB", n=len(means))])
 
     def network(self) -> None:
-        """The preview without a network and by each."""
+        """Compare the preview without a network with the preview by each network."""
         pictures, found = list[Picture](), dict[str, list[tuple[str, float]]]()
         for number, judged in enumerate(self.worlds):
             light = self._light(number, Choice(self.settings.usual, PREVIEW, 0))
@@ -213,7 +215,7 @@ class Run:
         self._keep("network", found, pictures)
 
     def weights(self) -> None:
-        """The paper's two latents under 5 x 5 weights; the first world is shown, all are scored."""
+        """Score 5 x 5 weights of the paper's two latents on all worlds; show the first world."""
         from tron.neural.renderer import NeuralRenderer
         from tron.neural.sweep import SWEEP, weight_sweep
 
@@ -237,7 +239,7 @@ class Run:
         self._keep("weights", found, pictures, columns=len(SWEEP))
 
     def fusion(self) -> None:
-        """Trainings that differ in how latents are fused, on the test split of their data."""
+        """Score trainings that differ in the fusion of latents, on the test split of their data."""
         s, data = self.settings, self.folder / "dataset"
         self.stages.run("dataset", [Child("dataset", "tron-datagen", [*s.dataset, f"output_dir={data}"])])
         files = dict[str, Path]()
@@ -265,7 +267,7 @@ class Run:
         self._keep("fusion", found, pictures)
 
     def sources(self) -> None:
-        """Surfels of true G-buffers, and of photos by each prior, under lights that no photo saw."""
+        """Relight surfels of true G-buffers, and of photos by each prior, under lights that no photo saw."""
         from eval.reconstruction.benchmark import relit_truths, scene_names
         from eval.reconstruction.relighting import Relit, relight, relit_pictures
         from eval.reconstruction.runs import read_report
@@ -301,7 +303,7 @@ class Run:
             self.outcome.show("sources", f"sources-{scene}", relit_pictures(f"Scene {scene}", each))
 
     def _light(self, number: int, choice: Choice) -> Illumination:
-        """A world's light at some surfels, made once for all choices that no bake knows."""
+        """Light a world's surfels; choices that do not change the bake share it."""
         from tron.relighting import Relighter
 
         estimation, judged = choice.estimation, self.worlds[number]
@@ -315,7 +317,7 @@ class Run:
         )
 
     def _vary(self, part: str, choices: Mapping[str, Choice], title: str) -> list[float]:
-        """Rows and pictures of a part; the means over the worlds, in the order of the choices."""
+        """Add rows and pictures of a part; return the means over the worlds, in the order of the choices."""
         pictures, found = list[Picture](), dict[str, list[tuple[str, float]]]()
         for number, judged in enumerate(self.worlds):
             for name, choice in choices.items():
@@ -357,7 +359,7 @@ def _enlarged(image: np.ndarray) -> np.ndarray:
 
 
 def _write_true_surfels(capture: Path, path: Path, count: int, seed: int) -> None:
-    """Surfels of the training views' true depth, normals and materials: nothing is reconstructed."""
+    """Write surfels made from the training views' true depth, normals and materials."""
     from tron.captures.folder import read_capture_folder
     from tron.reconstruction.geometry.initial import surfels_from_depth
     from tron.reconstruction.settings import InitialSettings

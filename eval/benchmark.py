@@ -26,11 +26,11 @@ class Benchmark(BaseModel, abc.ABC):
     targets: list[Target] = Field(default_factory=list)
 
     def bounds(self) -> list[Target]:
-        """The targets that the rows are held to, those of a benchmark inside this one included."""
+        """Return the targets of the rows, including targets of a nested benchmark."""
         return self.targets
 
     def check(self) -> None:
-        """Look at the inputs before anything is written.
+        """Check the inputs before anything is written.
 
         Raises:
             TronError: an input is missing or is not what it should be.
@@ -38,7 +38,7 @@ class Benchmark(BaseModel, abc.ABC):
 
     @abc.abstractmethod
     def run(self, output_dir: Path) -> Outcome:
-        """Measure. Pictures and other files go below ``output_dir``, which exists.
+        """Measure, and write pictures and other files below ``output_dir``, which exists.
 
         Raises:
             TronError: an input is missing or is not what it should be.

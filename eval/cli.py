@@ -1,4 +1,4 @@
-"""`tron-eval`: run one benchmark, write results.json and report.html, and print what was found."""
+"""`tron-eval`: run one benchmark, write results.json and report.html, and print the figures."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 
 
 class Settings(BaseModel):
-    """Settings of `tron-eval`; what belongs to one benchmark alone lies under `benchmark`."""
+    """Settings of `tron-eval`; settings of one benchmark are under `benchmark`."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -50,16 +50,17 @@ class Settings(BaseModel):
         description="weights of the neural renderer (.safetensors); [a,b]: one with lit, one of two buffers",
     )
     pixel_mlp: Path | list[Path] | None = Field(
-        default=None, description="weights of the pixel MLP baseline, likewise"
+        default=None, description="weights of the pixel MLP baseline; [a,b] as for renderer"
     )
     suite: Path | None = Field(
         default=None,
-        description="suite of scenes that methods are judged on or made for; export=NAME writes one",
+        description="suite of scenes for methods and their comparison; export=NAME writes one",
     )
     methods: Path | list[Path] | None = Field(
-        default=None, description="folder of methods' folders of pictures of the suite, or [a,b]"
+        default=None,
+        description="folder with a folder of pictures for each method, or a list of such folders, [a,b]",
     )
-    threads: PositiveInt = Field(default=1, description="threads that the networks use")
+    threads: PositiveInt = Field(default=1, description="CPU threads of the networks")
     seed: int = Field(default=0, description="seed of every random choice")
 
 
@@ -115,25 +116,25 @@ def main(settings: Settings) -> int:
 
 
 def _export(settings: Settings) -> str:
-    """Write a suite; its id is what methods cite."""
+    """Write a suite and log its id, which methods cite."""
     suite = make(settings.export or {}, "export").write(settings.output_dir)
     lights = sum(len(scene.lights) for scene in suite.scenes.values())
     return f"suite {suite.id}: {len(suite.scenes)} scenes, {lights} lights, in {suite.folder.absolute()}"
 
 
 def _method(settings: Settings) -> str:
-    """Write the folders of methods that run here."""
+    """Run a method and write its folders."""
     folders = make(settings.method or {}, "method").make(settings.output_dir.absolute())
     return "\n".join(f"method: {folder}" for folder in folders)
 
 
 def settings_of(benchmark: Benchmark) -> dict[str, Any]:
-    """What a benchmark was told, as JSON has it; targets stand beside it in results.json."""
+    """Return a benchmark's settings as JSON values, without targets, which results.json has beside them."""
     return benchmark.model_dump(mode="json", exclude={"targets"})
 
 
 def typed() -> list[str]:
-    """The command that runs, as it was typed; none where Python called it."""
+    """Return the running command as typed; none if Python called it."""
     name, *arguments = sys.argv
     return [shlex.join(["tron-eval", *arguments])] if Path(name).name == "tron-eval" else []
 

@@ -1,4 +1,4 @@
-"""Confidence intervals over scenes: how far a mean over few scenes may lie from that over all such scenes.
+"""Confidence intervals over scenes: how far a mean over few scenes may be from the mean over all such scenes.
 
 Frames, lights and views of one scene are no independent observations, so whole scenes are drawn with
 replacement (a cluster bootstrap), all figures of a scene together: differences are paired.
@@ -33,7 +33,7 @@ Statistic = Callable[[np.ndarray], np.ndarray]
 
 @dataclass(frozen=True)
 class Interval:
-    """``low`` and ``high`` in the figure's unit, None for a single scene; ``scenes`` that were drawn from."""
+    """Ends ``low`` and ``high`` in the figure's unit, None for one scene; ``scenes`` is the sample size."""
 
     scenes: int
     low: float | None = None
@@ -41,13 +41,13 @@ class Interval:
 
 
 def interval(per_scene: np.ndarray, statistic: Statistic, seed: int) -> Interval:
-    """The interval of a figure that is computed from sums over scenes.
+    """Return the interval of a figure that is computed from sums over scenes.
 
     Args:
         per_scene: (n, k) sums of each scene, such as a number of frames and their PSNR added up.
-        statistic: the figure; for a mean the quotient of two sums. It is asked about thousands of resamples
-            at once, (RESAMPLES, k).
-        seed: the run's; the same scenes are drawn for all figures of as many scenes.
+        statistic: the figure; for a mean the quotient of two sums. It is called on thousands of
+            resamples at once, (RESAMPLES, k).
+        seed: seed of the run; all figures over n scenes share the same resamples.
     """
     count = len(per_scene)
     if count < 2:
@@ -69,9 +69,9 @@ def interval(per_scene: np.ndarray, statistic: Statistic, seed: int) -> Interval
 
 
 def without_one(per_scene: np.ndarray, statistic: Statistic) -> tuple[float, float] | None:
-    """Least and greatest of a figure where one scene is left out; None of fewer than three scenes.
+    """Return the least and greatest figure with one scene left out; None for fewer than three scenes.
 
-    It says whether a single scene carries the figure, which an interval over few scenes does not show.
+    The range shows whether one scene carries the figure; an interval over few scenes does not.
     """
     if len(per_scene) < 3:
         return None
@@ -80,23 +80,23 @@ def without_one(per_scene: np.ndarray, statistic: Statistic) -> tuple[float, flo
 
 
 def expanded_level(scenes: int) -> float:
-    """Level of percentiles of n scenes' resamples that stands for LEVEL: 1 - 2 Φ(-sqrt(n / (n - 1)) t)."""
+    """Return the percentile level that gives LEVEL over n scenes: 1 - 2 Φ(-sqrt(n / (n - 1)) t)."""
     student = scipy.stats.t.ppf((1 + LEVEL) / 2, scenes - 1)
     return 1 - 2 * float(scipy.stats.norm.cdf(-np.sqrt(scenes / (scenes - 1)) * student))
 
 
 def quotient(sums: np.ndarray) -> np.ndarray:
-    """The first of two sums over the second: a mean, or the share of pixels that have a fault."""
+    """Divide the first of two sums by the second: a mean, or a share of faulty pixels."""
     return sums[..., 0] / sums[..., 1]
 
 
 def mean_interval(scenes: Sequence[str], values: Sequence[float], seed: int) -> Interval:
-    """The interval of a mean over values, of which ``scenes`` names the scene of each."""
+    """Return the interval of a mean over values; ``scenes`` names the scene of each value."""
     return interval(scene_sums(scenes, np.stack([values, np.ones(len(values))], axis=1)), quotient, seed)
 
 
 def scene_sums(scenes: Sequence[str], values: np.ndarray) -> np.ndarray:
-    """Rows of ``values`` (m, k) added up by scene: (n, k) float64, in the order of the scenes' names."""
+    """Add up rows of ``values`` (m, k) by scene: (n, k) float64, in the order of the scenes' names."""
     names, place = np.unique(np.asarray(scenes), return_inverse=True)
     sums = np.zeros((len(names), values.shape[1]))
     np.add.at(sums, place, values)

@@ -1,6 +1,6 @@
-"""Benchmark `datagen`: the speed of the data engine, and how long path tracing takes to be as near as lit.
+"""Benchmark `datagen`: speed of the data engine, and time of path tracing to an error as low as lit's.
 
-That it survives kills, hostile files, full disks and merging is asked in tests/robustness and tests/datagen.
+Kills, hostile files, full disks and merging are tested in tests/robustness and tests/datagen.
 """
 
 from __future__ import annotations
@@ -32,13 +32,13 @@ FIGURES = {"error": "abs", "seconds": "s", "paths": "1"}
 
 
 class Datagen(Benchmark):
-    """Recipes of the parts: arguments of tron-datagen."""
+    """Settings: arguments of tron-datagen for each part."""
 
     name: ClassVar[str] = "datagen"
 
-    parts: list[Literal["throughput", "equal_error"]] = Field(description="what is measured", min_length=1)
-    seed: int = Field(default=1000, description="seed of the intervals")
-    throughput: list[str] = Field(description="recipe of the frames that are counted")
+    parts: list[Literal["throughput", "equal_error"]] = Field(description="parts to measure", min_length=1)
+    seed: int = Field(default=1000, description="seed of the confidence intervals")
+    throughput: list[str] = Field(description="recipe of the throughput measurement")
     sizes: dict[PositiveInt, list[str]] = Field(description="width of a frame -> further arguments")
     equal_error: list[str] = Field(
         description="recipe of the scenes on which guidance and path tracer are compared; "
@@ -51,7 +51,7 @@ class Datagen(Benchmark):
         script_path(SCRIPT)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part.
+        """Measure part by part.
 
         Raises:
             StageFailed: tron-datagen failed.
@@ -77,7 +77,7 @@ class Datagen(Benchmark):
         return outcome
 
     def _throughput(self, stages: Stages, output: Path, width: int, more: list[str]) -> Iterator[Row]:
-        """Make scenes anew: frames an hour of running workers, and seconds a frame by stage.
+        """Make scenes and measure frames per hour and worker, and seconds per frame of each stage.
 
         The first scene of each worker, which compiles the kernels, does not count.
         """
@@ -104,7 +104,7 @@ class Datagen(Benchmark):
             yield Row(metric=metric, value=value / count, unit="s", n=len(counted))
 
     def _equal_errors(self, stages: Stages, dataset: Path) -> Iterator[Row]:
-        """Time of our frames over the path tracer's at their error; scenes are made once."""
+        """Yield rows of our frame time over the path tracer's at equal error; scenes are made once."""
         arguments = [*self.equal_error, f"output_dir={dataset}"]
         stages.run("models", [Child("models", SCRIPT, arguments)])
         stages.restart("equal_error")
@@ -124,14 +124,14 @@ class Datagen(Benchmark):
 
 
 def counted_scenes(records: list[dict[str, Any]]) -> list[dict[str, Any]]:
-    """Scenes that were made, but for the first of each worker where others are left."""
+    """Return the finished scenes without the first of each worker, if others are left."""
     made = [each for each in records if each["made"]]
     first = {each["worker"]: each for each in reversed(made)}
     return [each for each in made if first[each["worker"]] is not each] or made
 
 
 def _records(path: Path) -> list[dict[str, Any]]:
-    """Lines of tron-datagen's times.jsonl: "scene", "worker", "made" and "seconds" by stage."""
+    """Read tron-datagen's times.jsonl: "scene", "worker", "made" and "seconds" by stage."""
     try:
         return [json.loads(line) for line in path.read_text("utf-8").splitlines()]
     except (OSError, ValueError) as error:

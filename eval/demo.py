@@ -46,27 +46,27 @@ REFINED = {"base_color_psnr": "dB", "normal_mae_deg": "deg", "silhouette_error":
 
 
 class Demo(Benchmark):
-    """Settings: the recipe of each stage; the evaluation's own settings lie under ``relighting``."""
+    """Settings: a recipe for each stage; ``relighting`` has the settings of the evaluation."""
 
     name: ClassVar[str] = "demo"
 
-    relighting: Relighting = Field(description="settings of the evaluation; its inputs are filled in")
+    relighting: Relighting = Field(description="settings of benchmark=relighting; its inputs are filled in")
     datagen: list[str] = Field(default=[DEMO], description="arguments of tron-datagen")
     large: list[str] = Field(
         default_factory=list, description="arguments of tron-datagen for larger frames; none: no pictures"
     )
-    train: list[str] = Field(default=[DEMO], description="arguments of tron-train, for all networks")
+    train: list[str] = Field(default=[DEMO], description="arguments of tron-train, the same for all networks")
     max_seconds: PositiveFloat | None = Field(
-        default=None, description="wall time of each training; null leaves it to the training recipe"
+        default=None, description="wall time of each training; null: as in the training recipe"
     )
     pixel_mlp_seconds: PositiveFloat | None = Field(
         default=None,
-        description="wall time of the per-pixel network's, if it needs less; null: as the others",
+        description="wall time of the per-pixel network's training; null: same as the others",
     )
-    train_threads: PositiveInt = Field(default=1, description="threads of each of the three trainings")
+    train_threads: PositiveInt = Field(default=1, description="CPU threads of each of the three trainings")
 
     def bounds(self) -> list[Target]:
-        """The targets, which are of the demo's own recipe; none where other data or trainings are judged."""
+        """Return the targets of the demo's own recipe; none for other data or trainings."""
         own = all(getattr(self, name) == [DEMO] for name in ("datagen", "train"))
         return self.targets if own else []
 
@@ -77,7 +77,7 @@ class Demo(Benchmark):
             script_path(name)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Run the stages that are not finished, evaluate, and add the ``demo.*`` rows.
+        """Run the unfinished stages, evaluate, and add the ``demo.*`` rows.
 
         Raises:
             StageFailed: a command failed; what was finished before it is kept and is not redone.
@@ -123,9 +123,9 @@ class Demo(Benchmark):
 
 
 def refinement(dataset: Path, seed: int) -> list[Row]:
-    """Rows ``refinement.*``: surfels before and after fitting to G-buffers, from the data engine's records.
+    """Return rows ``refinement.*``: surfels before and after the fit to G-buffers, by tron-datagen's records.
 
-    Means over all scenes, at cameras that they were not fitted to; none where surfels were taken as made.
+    Means are over all scenes at held-out cameras; there are none if surfels were not fitted.
     ``seed`` draws the scenes of the intervals.
 
     Raises:
@@ -151,9 +151,9 @@ def refinement(dataset: Path, seed: int) -> list[Row]:
 
 
 def show_large_frames(dataset: Path, outcome: Outcome) -> None:
-    """One frame of each test scene by the checkpoints that ship, which never saw the demo's data.
+    """Show one frame of each test scene by the shipped checkpoints, which never saw the demo's data.
 
-    Each is under another light than the scene's before. None where this installation came without
+    Each frame is under another light than the previous scene's. None if this installation has no
     checkpoints.
 
     Raises:
@@ -170,7 +170,7 @@ def show_large_frames(dataset: Path, outcome: Outcome) -> None:
 
 
 def _seconds_per_scene(dataset: Path, seconds: float) -> Row:
-    """Wall time of the data engine over the scenes it made; its workers make several at a time."""
+    """Divide the wall time of the data engine by its number of scenes; workers make several at a time."""
     keys = (key for entry in Manifest.load(dataset).shards for key in entry.keys)
     scenes = len({key.rsplit("-", 1)[0] for key in keys})
     return Row(metric="datagen.seconds_per_scene.demo", value=seconds / scenes, unit="s", n=scenes)

@@ -1,4 +1,4 @@
-"""One factor on all light of a scene, which photos do not tell: bright paint in dim light looks the same."""
+"""One factor on all light of a scene, which photos do not fix: bright paint in dim light looks the same."""
 
 from __future__ import annotations
 
@@ -19,11 +19,11 @@ def fitted_factor(
     lights: Sequence[tuple[np.ndarray, float, np.ndarray, np.ndarray]],
     curve: Callable[[np.ndarray], np.ndarray] = agx,
 ) -> float:
-    """The one factor on radiance that brings display values nearest to the truth, in the mean square.
+    """Return the factor on radiance that minimises the mean squared error of display values.
 
     Args:
-        lights: of each its radiance (K, H, W, 3), exposure, true display values (K, H, W, 3) and the pixels
-            that count (K, H, W) bool.
+        lights: per light: radiance (K, H, W, 3), exposure, true display values (K, H, W, 3), and a mask of
+            the pixels that count (K, H, W) bool.
         curve: tone curve of exposed radiance.
     """
 

@@ -1,7 +1,7 @@
-"""results.json -> report.html: the benchmark's template, with figures from rows, curves and pictures.
+"""Write report.html from results.json: a template with figures from rows, curves and pictures.
 
-A page is one template, ``eval/report/NAME.html.j2``, that extends ``benchmark.html.j2``. The functions
-of :class:`Figures` stand in it by their names. A metric may be a pattern: ``*`` is any word without a
+A page is one template, ``eval/report/NAME.html.j2``, that extends ``benchmark.html.j2``. Templates call the
+methods of :class:`Figures` by name. A metric may be a pattern: ``*`` is any word without a
 point.
 """
 
@@ -33,7 +33,7 @@ MULTIPLES = {"k": 1e3, "m": 1e6}
 
 
 def write_page(folder: Path) -> Path:
-    """Write ``folder/report.html`` from results.json; pictures that are not beside it are left out.
+    """Write ``folder/report.html`` from results.json; missing pictures are left out.
 
     Raises:
         TronError: there is no results.json, or the folder cannot be written.
@@ -56,11 +56,11 @@ def write_page(folder: Path) -> Path:
 
 
 class Figures:
-    """Functions of the templates.
+    """Functions for templates.
 
     Args:
-        results: what was measured.
-        folder: of results.json, of its pictures, and of stages.json where commands were run.
+        results: results of the benchmark.
+        folder: folder of results.json, of its pictures, and of stages.json if commands were run.
     """
 
     def __init__(self, results: Results, folder: Path):
@@ -71,34 +71,34 @@ class Figures:
         self.commit = commit + (" with uncommitted changes" if results.environment.get("dirty") else "")
 
     def row(self, metric: str) -> Row | None:
-        """The first row of that name or pattern."""
+        """Return the first row of a name or pattern."""
         return next(iter(self.rows(metric)), None)
 
     def rows(self, pattern: str) -> list[Row]:
-        """All rows of a pattern, in their order."""
+        """Return all rows of a pattern, in order."""
         if "*" not in pattern:
             return [self._rows[pattern]] if pattern in self._rows else []
         found = _compiled(pattern)
         return [row for row in self.results.rows if found.fullmatch(row.metric)]
 
     def value(self, metric: str) -> str:
-        """Figure with its unit and interval; a dash where it was not measured."""
+        """Format a figure with its unit and interval; a dash if it was not measured."""
         row = self.row(metric)
         return "—" if row is None else with_interval(row)
 
     def span(self, pattern: str) -> str:
-        """Least and greatest of the rows' values: ``14.0 to 31.1``."""
+        """Format the least and greatest value of rows: ``14.0 to 31.1``."""
         values = [row.value for row in self.rows(pattern)]
         ends = list(dict.fromkeys(f"{each:.1f}" for each in (min(values), max(values)))) if values else ["—"]
         return " to ".join(ends)
 
     def names(self, pattern: str, without: Iterable[str] = ()) -> list[str]:
-        """What stands for the pattern's first ``*``, in the order of the rows."""
+        """Return the words that match the pattern's first ``*``, in the order of the rows."""
         found = (_compiled(pattern).fullmatch(row.metric) for row in self.results.rows)
         return list(dict.fromkeys(each[1] for each in found if each and each[1] not in without))
 
     def each(self, pattern: str, names: Iterable[str]) -> dict[str, str]:
-        """Columns of a table: a name -> the pattern with the name in place of ``{}``."""
+        """Return columns of a table: name -> the pattern with the name in place of ``{}``."""
         return {name: pattern.replace("{}", name) for name in names}
 
     def table(
@@ -110,15 +110,15 @@ class Figures:
         words: Mapping[str, str] | None = None,
         strong: Sequence[str] = (),
     ) -> Table | None:
-        """A table of figures; None where there are none. Rows and columns without a figure are left out.
+        """Return a table of figures, None without figures. Rows and columns without a figure are left out.
 
         Args:
-            caption: what it shows.
+            caption: caption of the table.
             columns: heading -> metric, ``*`` in place of the row's key.
             rows: key -> label; by default every key that a column has.
             first: heading of the labels.
-            words: key -> what a last column says of it.
-            strong: keys of rows that stand out.
+            words: key -> text of a last column.
+            strong: keys of emphasised rows.
         """
         keys = rows or {key: key for pattern in columns.values() for key in self.names(pattern)}
         found = {key: [self._rows.get(p.replace("*", key, 1)) for p in columns.values()] for key in keys}
@@ -136,19 +136,19 @@ class Figures:
         return Table(caption, headings, table, words=[len(there) + 1] if words else ()) if table else None
 
     def figures(self, caption: str, metrics: Mapping[str, str]) -> Table | None:
-        """A table of a figure a row: metric -> its words."""
+        """Return a table with one figure per row, from metric -> description."""
         return self.table(caption, {"Measured": "*"}, metrics)
 
     def growth(
         self, caption: str, x_label: str, y_label: str, lines: Mapping[str, str], square: bool = False
     ) -> Chart | None:
-        """A logarithmic chart over what the rows' names count: ``*`` stands for 200k or 512.
+        """Return a logarithmic chart over the count in the rows' names: ``*`` stands for 200k or 512.
 
         Args:
-            caption: ``{}`` in it, and in the patterns, is what the other part of the names counts, of which
-                the one with the most points is taken.
+            caption: ``{}`` in it, and in the patterns, is the other count in the names; the value with the
+                most points is taken.
             lines: label -> pattern.
-            square: the count is the width of a square.
+            square: whether the count is the width of a square.
         """
         both = [_compiled(pattern.replace("*", "+").replace("{}", "*")) for pattern in lines.values()]
         found = [each.fullmatch(row.metric) for each in both for row in self.results.rows]
@@ -165,7 +165,7 @@ class Figures:
         return line_chart(drawn, x_label, y_label, shown, logarithmic=True) if drawn else None
 
     def curves(self, name: str, caption: str, x_label: str, y_label: str, target: str = "") -> Chart | None:
-        """A chart of a series; ``target`` is the metric whose bound is drawn."""
+        """Return a chart of a series; the bound of the metric ``target`` is drawn."""
         lines = self.results.series.get(name)
         held = next(((each.what, each.value) for each in self.results.targets if each.metric == target), None)
         if held is not None:
@@ -173,12 +173,12 @@ class Figures:
         return line_chart(lines, x_label, y_label, caption, held) if lines else None
 
     def pictures(self, section: str) -> list[Pictures | Films]:
-        """Pictures and films of a section, but for those on the first screen."""
+        """Return pictures and films of a section, except the ones on the first screen."""
         groups = [g for g in self.results.pictures if g.section == section and g.file != self._opened]
         return [found for group in groups if (found := load_group(self._folder, group)) is not None]
 
     def opening(self) -> Pictures | Films | None:
-        """The first pictures of all, for the first screen."""
+        """Return the first pictures, for the first screen."""
         for group in self.results.pictures:
             if (found := load_group(self._folder, group)) is not None:
                 self._opened = group.file
@@ -186,7 +186,7 @@ class Figures:
         return None
 
     def note(self, metric: str, observed: str = "") -> str:
-        """A note on the intervals of figures that are averaged as the metric is; empty without it.
+        """Return a note on intervals of figures that are averaged like the metric; empty without it.
 
         ``observed`` names what the scenes hold, such as "frames".
         """
@@ -196,7 +196,7 @@ class Figures:
         return interval_note(row.scenes, f"{row.n} {observed}" if observed else "")
 
     def tiled(self, headline: Mapping[str, str]) -> list[Tile]:
-        """Headline figures, metric -> label, with the verdict on each that has a target."""
+        """Return tiles of headline figures, metric -> label, with verdicts on targets."""
         by_metric = {target.metric: target for target in self.results.targets}
         tiles = []
         for pattern, label in headline.items():
@@ -213,7 +213,7 @@ class Figures:
         return tiles
 
     def tally(self) -> str:
-        """How many targets are reached, in a sentence."""
+        """Return a sentence with the number of reached targets."""
         values = [(target, self.results.value(target.metric)) for target in self.results.targets]
         verdicts = [target.reached(value) for target, value in values if value is not None]
         if not verdicts:
@@ -223,7 +223,7 @@ class Figures:
         return f"{sum(verdicts)} of {len(verdicts)} targets are reached{more}."
 
     def targets(self) -> Table | None:
-        """Every target and the verdict on it."""
+        """Return a table of the targets and their verdicts."""
         rows = []
         for target in self.results.targets:
             row = self._rows.get(target.metric)
@@ -238,12 +238,12 @@ class Figures:
         )
 
     def absent(self) -> Table | None:
-        """Figures that could not be measured, and why; None where all were."""
+        """Return the figures that could not be measured, with reasons; None if there are none."""
         lacking = list(self.results.absent.items())
         return Table("Not measured, and why.", ["Figure", "Why"], lacking, words=[1]) if lacking else None
 
     def stages(self) -> Table | None:
-        """Wall time, commit and commands of the stages in stages.json; None without any."""
+        """Return wall time, commit and commands of the stages in stages.json; None without stages."""
         path = self._folder / "stages.json"
         if not path.is_file():
             return None
@@ -270,7 +270,7 @@ class Figures:
         return Table(caption, headings, rows, words=[4]) if rows else None
 
     def machine(self) -> Table:
-        """Where and with what it was measured."""
+        """Return the machine and the versions of the measurement."""
         environment = self.results.environment
         described = {"commit": self.commit}
         for key, value in {**environment, **environment.get("inputs", {})}.items():
@@ -280,7 +280,7 @@ class Figures:
         return Table(caption, ["Property", "Value"], list(described.items()), words=[1])
 
     def reproduce(self) -> Code | None:
-        """Commands that measure it again."""
+        """Return the commands that repeat the measurement."""
         return Code("\n".join(self.results.reproduce)) if self.results.reproduce else None
 
 
@@ -289,7 +289,7 @@ def _compiled(pattern: str) -> re.Pattern[str]:
 
 
 def _count(name: str) -> float | None:
-    """The number that a name such as 200k or 512 counts."""
+    """Return the number in a name such as 200k or 512."""
     found = re.fullmatch(r"(\d+)([km]?)", name)
     return None if found is None else float(found[1]) * MULTIPLES.get(found[2], 1)
 

@@ -1,4 +1,4 @@
-"""Figures of one benchmark on one machine (results.json), and the targets they are held to.
+"""Figures of one benchmark on one machine (results.json), and their targets.
 
 The file is ``{"benchmark", "environment", "rows": [{"metric", "value", "unit", "reference", "ratio",
 "n"}]}``. Metric names are unique; a figure that was not measured has no row (``absent`` may say why), and a
@@ -40,14 +40,14 @@ class Row(BaseModel):
     metric: str = Field(pattern=METRIC_PATTERN, description="what was measured, e.g. neural.psnr_full.sun")
     value: FiniteFloat = Field(description="the figure, in its unit")
     unit: str = Field(min_length=1, description="dB, s, deg, x (times), fraction, bytes, abs (error) or 1")
-    reference: str | None = Field(default=None, description="what the value is held against, in words")
-    ratio: FiniteFloat | None = Field(default=None, description="the value over the reference's number")
-    n: PositiveInt = Field(description="number of things that it was averaged over")
+    reference: str | None = Field(default=None, description="reference of the value, in words")
+    ratio: FiniteFloat | None = Field(default=None, description="value / reference")
+    n: PositiveInt = Field(description="number of averaged items")
     low: FiniteFloat | None = Field(default=None, description="lower end of the interval over scenes")
-    high: FiniteFloat | None = Field(default=None, description="upper end")
-    scenes: PositiveInt | None = Field(default=None, description="independent scenes behind the n")
+    high: FiniteFloat | None = Field(default=None, description="upper end of the interval over scenes")
+    scenes: PositiveInt | None = Field(default=None, description="number of independent scenes among the n")
     without_one: tuple[FiniteFloat, FiniteFloat] | None = Field(
-        default=None, description="least and greatest figure where one scene is left out"
+        default=None, description="least and greatest figure with one scene left out"
     )
 
     @pydantic.model_validator(mode="after")
@@ -62,7 +62,7 @@ class Row(BaseModel):
         return self
 
     def within(self, interval: Interval) -> Row:
-        """A copy with the interval over scenes."""
+        """Return a copy with the interval over scenes."""
         return self.model_copy(update={"low": interval.low, "high": interval.high, "scenes": interval.scenes})
 
     @pydantic.model_serializer(mode="wrap")
@@ -72,7 +72,7 @@ class Row(BaseModel):
 
 
 def mean_row(metric: str, unit: str, found: Iterable[tuple[str, float]], seed: int) -> Row:
-    """The mean of what was ``found``, (scene, value) each, with its interval over scenes.
+    """Return the mean of ``found``, pairs of (scene, value), with its interval over scenes.
 
     ``seed`` draws the scenes of the interval.
     """
@@ -86,17 +86,17 @@ class Target(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    metric: str = Field(pattern=METRIC_PATTERN, description="the row that it holds")
+    metric: str = Field(pattern=METRIC_PATTERN, description="name of the row")
     bound: Literal["at least", "at most"] = Field(description="the good side")
-    value: FiniteFloat = Field(description="in the row's unit")
+    value: FiniteFloat = Field(description="the bound, in the row's unit")
     what: str = Field(default="", description="the metric in words, for the report")
 
     def margin(self, measured: float) -> float:
-        """Distance of ``measured`` to the bound, in its unit; negative when the bound is missed."""
+        """Return the distance of ``measured`` to the bound, in its unit; negative if the bound is missed."""
         return measured - self.value if self.bound == "at least" else self.value - measured
 
     def reached(self, measured: float) -> bool:
-        """Whether the unrounded figure keeps to the bound."""
+        """Whether the unrounded figure reaches the bound."""
         return self.margin(measured) >= 0
 
 
@@ -121,7 +121,7 @@ class Group(BaseModel):
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    section: str = Field(description="of the page that shows them")
+    section: str = Field(description="section of the page that shows them")
     file: str
     title: str
     note: str = ""
@@ -134,7 +134,7 @@ _ABSOLUTE = re.compile(r"(?<![\w./:~])(?:/[\w.@+-]+)+(?=/[\w.@+-]+/[\w.@+-]+)/")
 
 
 def portable(value: Any) -> Any:
-    """JSON whose texts name files by their last folder and name: where these lay tells nobody anything."""
+    """Return JSON with paths reduced to last folder and name: other machines have other folders."""
     if isinstance(value, str):
         return _ABSOLUTE.sub("", value)
     if isinstance(value, dict):
@@ -151,10 +151,8 @@ class Results(BaseModel):
     environment: dict[str, Any]
     rows: list[Row]
     targets: list[Target] = Field(default_factory=list)
-    absent: dict[str, str] = Field(
-        default_factory=dict, description="figure that could not be measured -> why, in words"
-    )
-    reproduce: list[str] = Field(default_factory=list, description="command lines that measure it again")
+    absent: dict[str, str] = Field(default_factory=dict, description="unmeasured figure -> reason, in words")
+    reproduce: list[str] = Field(default_factory=list, description="commands that repeat the measurement")
     series: dict[str, dict[str, list[tuple[FiniteFloat, FiniteFloat]]]] = Field(
         default_factory=dict, description="name of a chart -> label of a line -> (x, y) of its points"
     )
@@ -170,16 +168,16 @@ class Results(BaseModel):
         return self
 
     def find(self, metric: str) -> Row | None:
-        """The row of that name, or None if it was not measured."""
+        """Return the row of a name, or None if it was not measured."""
         return next((row for row in self.rows if row.metric == metric), None)
 
     def value(self, metric: str) -> float | None:
-        """The value of that name, or None if it was not measured."""
+        """Return the value of a name, or None if it was not measured."""
         row = self.find(metric)
         return None if row is None else row.value
 
     def held_to(self, targets: Iterable[Target]) -> Results:
-        """A copy with the targets; rows name theirs as ``reference``, with ``ratio`` = value / target."""
+        """Return a copy with the targets; rows get it as ``reference``, and ``ratio`` = value / target."""
         targets = list(targets)
         by_metric = {target.metric: target for target in targets}
 
@@ -197,7 +195,7 @@ class Results(BaseModel):
     def save(self, path: str | Path) -> None:
         """Write the file whole or not at all; TronError if the folder cannot be written.
 
-        Folders of this machine are left out of what it says (:func:`portable`).
+        Folders of this machine are removed from its texts (:func:`portable`).
 
         Raises:
             ValueError: two rows share a name, or a value is not finite (a defect of the benchmark).

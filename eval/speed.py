@@ -1,9 +1,10 @@
-"""Benchmark `speed`: frames a second of every way to light a scene, and how long an edit takes to be seen.
+"""Benchmark `speed`: frames per second of every way to light a scene, and seconds until an edit is seen.
 
-A small world of surfels under a sun, whose camera turns. All ways take turns in one process
-(:mod:`eval.timing`); a figure is a median of rounds. A frame ends when its picture lies in the host's memory,
-and what no camera changes is ready before: hierarchies, transport, the bake of the light. An edit has to redo
-of that what it touches. The paper's figures stand beside ours, by its name and with its machine.
+The camera turns around a small world of surfels under a sun. All ways take turns in one process
+(:mod:`eval.timing`); a figure is a median of rounds. A frame ends when its picture is in host memory. Work
+that does not depend on the camera is done before: hierarchies, transport, the bake of the light. An edit
+redoes the part of this work that it changes. The paper's figures are shown beside ours, with the paper's
+machine.
 """
 
 from __future__ import annotations
@@ -55,27 +56,29 @@ Draw = Callable[["Illumination", Sequence[Camera]], np.ndarray]
 
 
 class Speed(Benchmark):
-    """Sizes and ways; beside results.json, times.json keeps every round's seconds."""
+    """Settings: sizes and ways; times.json beside results.json has the seconds of every round."""
 
     name: ClassVar[str] = "speed"
 
     renderer: Path | list[Path] | None = Field(
-        default=None, description="weights of networks, or shipped names; null: both that are shipped"
+        default=None, description="weights of networks, or names of shipped ones; null: both shipped networks"
     )
     variants: list[Literal["llvm_ad_rgb", "cuda_ad_rgb"]] | None = Field(
         default=None,
-        description="Mitsuba variants, one process each; null: the processor, and the GPU where there is one",
+        description="Mitsuba variants, one process each; null: CPU, and GPU if there is one",
     )
-    threads: PositiveInt | None = Field(default=None, description="of Dr.Jit and of torch; null: one a core")
+    threads: PositiveInt | None = Field(
+        default=None, description="torch and Dr.Jit threads; null: one a core"
+    )
     seed: int = 0
-    surfels: PositiveInt = Field(default=50_000, description="of the scene, about")
+    surfels: PositiveInt = Field(default=50_000, description="approximate number of surfels of the scene")
     sizes: list[PositiveInt] = Field(description="width of the square frames", min_length=1)
-    edits: list[Edit] = Field(description="what is edited: the light turns, a thing changes or moves")
+    edits: list[Edit] = Field(description="edits: the light turns, a thing changes or moves")
     edit_size: PositiveInt = Field(default=512, description="width of the frames after an edit")
     network_sizes: list[Annotated[int, Field(ge=8)]] = Field(
-        description="width of the frames of networks alone, guidance given, and of training steps"
+        description="width of the frames of networks alone (without making guidance) and of training steps"
     )
-    rounds: PositiveInt = Field(default=5, description="in turns; three of what takes over a second")
+    rounds: PositiveInt = Field(default=5, description="rounds in turns; three if over a second")
 
     def check(self) -> None:
         """Find the checkpoints."""
@@ -83,11 +86,11 @@ class Speed(Benchmark):
             find_weights(path)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure by this process's variant, and by others in processes of their own.
+        """Measure with this process's variant, and with other variants in separate processes.
 
         Raises:
             StageFailed: another variant's process failed.
-            TronError: weights or a variant are not there.
+            TronError: weights or a variant are missing.
         """
         self.check()
         outcome, (own, *others) = Outcome(output_dir), self._variants()
@@ -119,7 +122,7 @@ class Speed(Benchmark):
         return list(DEVICES) if describe_machine()["gpu"] != "none" else ["llvm_ad_rgb"]
 
     def _typed(self, variant: str) -> list[str]:
-        """Arguments of tron-eval that measure the same by another variant."""
+        """Return arguments of tron-eval for the same measurement with another variant."""
         plain = self.model_dump(mode="json", exclude={"targets", "variants", "renderer"})
         given = [
             f"benchmark.{key}={value}".replace(" ", "") for key, value in plain.items() if value is not None
@@ -183,7 +186,7 @@ class Speed(Benchmark):
 
 
 class Lights:
-    """A scene under its light by every estimation of the ways, made when first asked for and kept."""
+    """A scene under its light by every estimation of the ways, computed on first use and kept."""
 
     def __init__(self, world: World, surfels: int, seed: int):
         self.scene, self._environment, self._seed = world.surfels(surfels), world.light, seed
@@ -192,7 +195,7 @@ class Lights:
         self._thing = ids == np.unique(ids)[-1]
 
     def under(self, estimation: Estimation) -> Illumination:
-        """The light by an estimation; those with as many bounces share all but the rays of a pixel."""
+        """Return the light by an estimation; estimations of equal bounces share all but the pixels' rays."""
         from tron.relighting import Relighter
 
         kind = estimation.bounces
@@ -202,7 +205,7 @@ class Lights:
         return self._made[kind].framed(rays=estimation.rays, filtered=estimation.filtered)
 
     def edited(self, estimation: Estimation, edit: Edit, number: int) -> Illumination:
-        """The same after an edit that differs with its number: what it touches is redone."""
+        """Return the light after edit ``number``; only changed parts are redone."""
         from tron.gaussians.edit import moved
 
         before = self.under(estimation)
@@ -223,10 +226,10 @@ class Way:
     """A way to make pictures of a lit scene.
 
     Attributes:
-        name: in rows.
-        estimation: of the light.
-        draw: pictures of some cameras under it.
-        frames: that it makes at a time.
+        name: name in rows.
+        estimation: estimation of the light.
+        draw: function that renders pictures of some cameras.
+        frames: number of frames per call.
     """
 
     name: str
@@ -235,7 +238,7 @@ class Way:
     frames: int = 1
 
     def frame(self, lights: Lights, cameras: Sequence[Camera], numbers: Iterator[int]) -> np.ndarray:
-        """Pictures from the next cameras of an orbit."""
+        """Render pictures from the next cameras of an orbit."""
         start = next(numbers)
         chosen = [cameras[(start + k) % len(cameras)] for k in range(self.frames)]
         return self.draw(lights.under(self.estimation), chosen)
@@ -243,12 +246,12 @@ class Way:
     def after(
         self, lights: Lights, cameras: Sequence[Camera], edit: Edit, numbers: Iterator[int]
     ) -> np.ndarray:
-        """The first pictures after the next edit."""
+        """Render the first pictures after the next edit."""
         return self.draw(lights.edited(self.estimation, edit, next(numbers)), cameras[: self.frames])
 
 
 def ways(networks: dict[str, Network], seed: int) -> list[Way]:
-    """Every way: the paper's three stages, ours, and the networks on single frames and on five."""
+    """Return every way: the paper's three stages, ours, and the networks on one frame and on five."""
     direct = Estimation(bounces=0)
     found = [Way("pbr", direct, _pbr)]
     for rays in (2, 64):
@@ -264,7 +267,7 @@ def ways(networks: dict[str, Network], seed: int) -> list[Way]:
 
 
 def _pbr(light: Illumination, cameras: Sequence[Camera]) -> np.ndarray:
-    """Split-sum shading: camera rays, and no others."""
+    """Render split-sum shading, which needs camera rays only."""
     import mitsuba as mi
 
     from tron.shading.guidance import Arriving, shade_surface
@@ -291,7 +294,7 @@ def _neural(seed: int, network: Network, light: Illumination, cameras: Sequence[
 
 
 def orbit(size: int, seed: int, steps: int = 60) -> list[Camera]:
-    """Square views of the world, a degree from one to the next."""
+    """Return square views of the world, one degree apart."""
     from eval.applications.worlds import view_of
 
     first = view_of(generator(seed, "speed", "camera"), size, size)
@@ -303,7 +306,7 @@ def orbit(size: int, seed: int, steps: int = 60) -> list[Camera]:
 
 
 def passes(network: Network, size: int, seed: int) -> dict[str, Callable[[], None]]:
-    """Name in rows -> one frame of random buffers through a network, and a training step on a copy of it."""
+    """Return name in rows -> call: a network on a frame of random buffers, or a training step of a copy."""
     import torch
 
     def noise() -> Iterator[torch.Tensor]:

@@ -1,4 +1,4 @@
-"""Long work done by other console commands: run, streamed, timed, and not done twice.
+"""Run other console commands as stages: streamed, timed, and skipped if finished.
 
 A stage is one or more commands that run at the same time. Its seconds are kept in ``stages.json`` and add up
 over interrupted attempts, so that a resumed demo still tells how long the whole of it took.
@@ -35,14 +35,14 @@ PATIENCE = 20.0
 
 
 def checkout() -> str:
-    """The short commit of the code that runs, with a + where the checkout has changes; empty outside one."""
+    """Return the short commit of the running code, with a + for local changes; empty outside a checkout."""
     machine = describe_machine()
     commit = str(machine.get("commit") or "")[:10]
     return commit + "+" if commit and machine.get("dirty") else commit
 
 
 class StageFailed(Exception):
-    """A child ended with an exit code other than 0; str() names the command, its code and its last words."""
+    """A child ended with a non-zero exit code; str() has the command, the code and its last output."""
 
     def __init__(self, command: str, exit_code: int, words: str):
         super().__init__(f"{command} failed with exit code {exit_code}: {words or 'it said nothing'}")
@@ -54,17 +54,17 @@ class StageRecord(BaseModel):
 
     model_config = ConfigDict(extra="forbid")
 
-    commands: list[list[str]] = Field(description="as typed")
+    commands: list[list[str]] = Field(description="commands as typed")
     seconds: NonNegativeFloat = Field(
-        default=0.0, description="wall time of all attempts, less that of stages within"
+        default=0.0, description="wall time of all attempts without nested stages"
     )
     attempts: int = Field(default=0, ge=0)
     finished: bool = False
-    commit: str = Field(default="", description="checkout() of the code that finished it")
+    commit: str = Field(default="", description="checkout() of the code that finished the stage")
 
 
 class StageFile(BaseModel):
-    """The whole of stages.json: stage name -> record, in the order in which they first ran."""
+    """Contents of stages.json: stage name -> record, in the order of first runs."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -76,9 +76,9 @@ class Child:
     """One command.
 
     Attributes:
-        label: before each of its lines in the log.
+        label: prefix of its lines in the log.
         script: console script.
-        arguments: of the script.
+        arguments: arguments of the script.
         environment: additions to its environment.
     """
 
@@ -89,12 +89,12 @@ class Child:
 
     @property
     def typed(self) -> list[str]:
-        """The command as one would type it."""
+        """The command as typed."""
         return [self.script, *self.arguments]
 
 
 class Stages:
-    """Runs stages and remembers them in ``folder/stages.json``."""
+    """Runner of stages, with records in ``folder/stages.json``."""
 
     def __init__(self, folder: Path):
         self.folder = RunFolder(folder, "a stage", "stages.json")
@@ -133,7 +133,8 @@ class Stages:
     def timed(self, name: str, commands: list[list[str]]) -> Iterator[StageRecord]:
         """Add the seconds of the block to the stage's record, and mark it finished if the block succeeds.
 
-        Those of stages within the block are theirs alone, so that all records add up to the time that passed.
+        Seconds of stages within the block count for these stages only, so all records add up to the time
+        passed.
         """
         record = self.records.setdefault(name, StageRecord(commands=commands))
         record.attempts += 1
@@ -148,12 +149,12 @@ class Stages:
             self.folder.keep(self.file.model_dump(mode="json"))
 
     def restart(self, name: str) -> None:
-        """Forget a stage: one that is cheap, and is measured anew every time."""
+        """Forget a cheap stage that is measured again every time."""
         self.records.pop(name, None)
 
 
 def _settings(commands: list[list[str]]) -> dict[str, dict[str, str]]:
-    """Commands as plain values: the number of each, its script, and its settings by their keys."""
+    """Return commands as plain values: number, script, and settings by key."""
     return {
         str(number): {
             "command": script,
@@ -164,7 +165,7 @@ def _settings(commands: list[list[str]]) -> dict[str, dict[str, str]]:
 
 
 def script_path(name: str) -> str:
-    """The console script beside this Python; TronError if it is not installed there."""
+    """Return the path of a console script beside this Python; TronError if it is not installed there."""
     folder = Path(sys.executable).parent
     found = shutil.which(name, path=str(folder))
     if found is None:
@@ -173,7 +174,7 @@ def script_path(name: str) -> str:
 
 
 def run_together(children: Sequence[Child]) -> None:
-    """Run commands at the same time, their output line by line behind their labels, until all have ended.
+    """Run commands at the same time until all have ended; print their output lines with their labels.
 
     When one fails, or this process is interrupted, the others are asked to end and, after PATIENCE, killed.
 
@@ -199,7 +200,7 @@ def run_together(children: Sequence[Child]) -> None:
 
 @contextmanager
 def _running(child: Child, path: str) -> Iterator[tuple[subprocess.Popen[str], deque[str]]]:
-    """A process and the last lines of its output, which a thread prints; the end of the block ends it."""
+    """Run a process while the block runs; a thread prints its output and keeps the last lines."""
     last: deque[str] = deque(maxlen=MESSAGE_LINES)
     _say(child.label, "$ " + " ".join(child.typed))
     process = subprocess.Popen(

@@ -1,4 +1,4 @@
-"""Times of several ways to do one thing, taken in turns so that a noisy machine disturbs them alike."""
+"""Time several contestants in turns, so that noise of the machine affects all equally."""
 
 from __future__ import annotations
 
@@ -22,7 +22,7 @@ SLOW_SECONDS, SLOW_ROUNDS = 1.0, 3
 
 @dataclass(frozen=True)
 class Times:
-    """Seconds of each repetition, in the order in which they were taken; round k of all stands at index k."""
+    """Seconds of each repetition in order; index k is round k of all contestants."""
 
     seconds: tuple[float, ...]
 
@@ -32,14 +32,14 @@ class Times:
         return float(np.median(self.seconds))
 
     def over(self, other: Times) -> float:
-        """Ratio of the medians of this and ``other``, over the rounds of both."""
+        """Return the median over the median of ``other``, over the rounds of both."""
         rounds = min(len(self.seconds), len(other.seconds))
         return float(np.median(self.seconds[:rounds]) / np.median(other.seconds[:rounds]))
 
 
 @dataclass(frozen=True)
 class Timed:
-    """Times of all contestants on one case.
+    """Times of all contestants in one case.
 
     Attributes:
         kind: name of the measurement in times.json.
@@ -52,17 +52,17 @@ class Timed:
     times: Mapping[str, Times]
 
     def row(self, metric: str, value: float, unit: str, *contestants: str) -> Row:
-        """Row of this case; ``n`` is the fewest rounds of the contestants, of all if none is named."""
+        """Return a row of this case; ``n`` is the fewest rounds of named contestants, by default of all."""
         rounds = min(len(self.times[name].seconds) for name in contestants or self.times)
         return Row(metric=f"{metric}.{self.case}", value=value, unit=unit, n=rounds)
 
     def over(self, metric: str, slow: str, fast: str) -> Row:
-        """Row of one contestant's time over another's."""
+        """Return a row of one contestant's time over another's."""
         return self.row(metric, self.times[slow].over(self.times[fast]), "x", slow, fast)
 
 
 def format_count(count: int) -> str:
-    """Number of surfels in a metric's name: 10000 -> '10k', 1000000 -> '1m', 300 -> '300'.
+    """Format a number of surfels for a metric's name: 10000 -> '10k', 1000000 -> '1m', 300 -> '300'.
 
     >>> format_count(200_000), format_count(1_000_000), format_count(1500)
     ('200k', '1m', '1500')
@@ -74,7 +74,7 @@ def format_count(count: int) -> str:
 
 
 def seconds_of(work: Callable[[], Any]) -> float:
-    """Time of one call until the device has finished; what it returns is evaluated within."""
+    """Time one call until the device has finished, including evaluation of the result."""
     dr.sync_thread()
     begin = time.perf_counter()
     dr.eval(work())
@@ -85,8 +85,8 @@ def seconds_of(work: Callable[[], Any]) -> float:
 def interleaved(contestants: Mapping[str, Callable[[], Any]], rounds: int) -> dict[str, Times]:
     """Time the contestants in turns: A B C, A B C, ...
 
-    Each is called once before, which compiles its kernels. One that takes over ``SLOW_SECONDS`` sits out once
-    it has ``SLOW_ROUNDS``; garbage is collected between rounds, never within.
+    Each is called once before, to compile its kernels. A contestant over ``SLOW_SECONDS`` stops after
+    ``SLOW_ROUNDS`` rounds; garbage is collected between rounds, never within.
     """
     for work in contestants.values():
         seconds_of(work)

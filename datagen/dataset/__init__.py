@@ -1,1 +1,1 @@
-"""What lies in a dataset's folder: records, card, previews, tables."""
+"""Files of a dataset's folder: records, card, previews, tables."""

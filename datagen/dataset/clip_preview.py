@@ -64,7 +64,7 @@ def script_name(key: str) -> str:
 
 
 def script(meta: ClipMeta, frames: Sequence[dict[str, np.ndarray]]) -> str:
-    """A call of the page's ``showClip`` with every tile: member, frame, whether it is light, PNG."""
+    """Return a call of the page's ``showClip`` with every tile: member, frame, whether it is light, PNG."""
     tiles = [_tile(meta, TARGET, number, frames[number]) for number in shown_frames(len(frames))]
     members = [name for name in MEMBERS if name in frames[0] and name not in (TARGET, *DEPTHS)]
     tiles += [_tile(meta, name, 0, frames[0]) for name in members]
@@ -72,14 +72,14 @@ def script(meta: ClipMeta, frames: Sequence[dict[str, np.ndarray]]) -> str:
 
 
 def preview_bytes(width: int, height: int, frames: int, members: int) -> int:
-    """Bytes that a clip's previews may take: its size in pixels, its frames, the members of a frame."""
+    """Return an upper bound of the bytes of a clip's previews, from its size, frames and members."""
     step = -(-max(width, height) // LARGEST_SIDE)
     pixels = (width // step) * (height // step)
     return (len(shown_frames(frames)) + members) * pixels * TILE_BYTES + pixels
 
 
 def shown_frames(count: int) -> list[int]:
-    """Numbers of the frames that a preview holds, of ``count``."""
+    """Return the numbers of the frames in a preview, out of ``count``."""
     return sorted({round(k) for k in np.linspace(0, count - 1, min(count, MOST_FRAMES))})
 
 
@@ -96,7 +96,7 @@ def _tile(meta: ClipMeta, member: str, number: int, frame: dict[str, np.ndarray]
 
 
 def shrink(image: np.ndarray) -> np.ndarray:
-    """(H', W', 3) float32 of (H, W), (H, W, 1) or (H, W, 3): means over squares if it is too large."""
+    """Reduce (H, W), (H, W, 1) or (H, W, 3) to (H', W', 3) float32 by means over squares, if too large."""
     image = np.asarray(image, np.float32)
     image = image if image.ndim == 3 else image[..., None]
     step = -(-max(image.shape[:2]) // LARGEST_SIDE)
@@ -121,9 +121,9 @@ def log_pixels(linear: np.ndarray) -> np.ndarray:
 
 
 def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> list[np.ndarray]:
-    """One frame's members as tiles, (H, W, 3) uint8 each.
+    """Return one frame's members as tiles, (H, W, 3) uint8 each.
 
-    Light goes through the clip's exposure and AgX, the rest through :func:`displayable`.
+    Light is shown by the clip's exposure and AgX, other members by :func:`displayable`.
     """
     tiles = []
     for member in (name for name in COLUMNS if name in frame):
@@ -140,17 +140,17 @@ def contact_row(meta: ClipMeta, frame: dict[str, np.ndarray]) -> list[np.ndarray
 
 
 def is_light(member: str) -> bool:
-    """Whether a member is radiance or irradiance, which exposure applies to; base color is neither."""
+    """Whether a member is radiance or irradiance, so that exposure applies; base color is neither."""
     return MEMBERS[member].color_space == "linear" and not member.startswith("base_color")
 
 
 def shown_as_is(meta: ClipMeta, member: str) -> bool:
-    """Whether a clip holds a member as display values, as it does photos."""
+    """Whether a clip has a member in display values, such as photos."""
     return meta.color_space.get(member) == "display"
 
 
 def displayable(member: str, image: np.ndarray) -> np.ndarray:
-    """Display values of a member that is no light, (H, W, C) in [0, 1]: no exposure applies to it.
+    """Return display values of a member that is not light, (H, W, C) in [0, 1], without exposure.
 
     Reflectance goes through the sRGB curve, normals through (n + 1) / 2.
     """
@@ -162,12 +162,12 @@ def displayable(member: str, image: np.ndarray) -> np.ndarray:
 
 
 def sheet_name(shard: str) -> str:
-    """previews/NAME.png of a shard's file name."""
+    """Return previews/NAME.png for a shard's file name."""
     return f"previews/{Path(shard).stem}.png"
 
 
 def sheet_clips(rows: Sequence[ClipRow]) -> list[ClipRow]:
-    """One clip each of at most SIDE times SIDE scenes, evenly over splits and styles, and over lights.
+    """Choose one clip each of at most SIDE x SIDE scenes, evenly over splits, styles and lights.
 
     Each pair of split and style gets the same number of places, or as many as it has scenes; its scenes are
     taken at even distances. The k-th scene shows its k-th light, in turns.
@@ -191,7 +191,7 @@ def sheet_clips(rows: Sequence[ClipRow]) -> list[ClipRow]:
 
 
 def scenes_sheet(folder: Path, rows: Sequence[ClipRow]) -> bytes | None:
-    """PNG of the scenes, at most eight by eight; None where no clip has a thumbnail.
+    """Return a PNG of the scenes, at most eight by eight; None if no clip has a thumbnail.
 
     Thumbnails are fitted into squares as large as the largest of them, and stay as small as LARGEST_SIDE.
 

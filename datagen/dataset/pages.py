@@ -1,7 +1,7 @@
-"""The two pages of a dataset: its card, README.md, and index.html to look at every clip.
+"""The two pages of a dataset: its card, README.md, and index.html, which shows every clip.
 
-The card says what is in the folder, under which licences, made by what, and by which exact command. Its
-sentences are in ``page/card.md.j2``; a source's own, in ``page/card.SOURCE.md.j2``, extend it.
+The card lists contents, licences, versions and the exact command. Its sentences are in ``page/card.md.j2``;
+``page/card.SOURCE.md.j2`` adds the sentences of a source.
 
 By its front matter and metadata.parquet the Hugging Face Hub, `datasets` and pandas read a dataset; shards
 are webdataset tars already. `datasets` takes the columns of a whole configuration from the first clips of one
@@ -53,15 +53,15 @@ def card_text(
     compared: Mapping[str, Histograms],
     pictures: Sequence[str],
 ) -> str:
-    """README.md, the same bytes for the same dataset.
+    """Return README.md, the same bytes for the same dataset.
 
     Args:
-        settings: what it was made with.
-        manifest: what it holds.
+        settings: settings of the dataset.
+        manifest: manifest of the dataset.
         sources: the user's files it drew from.
-        listed: those by split.
+        listed: the user's files by split.
         made: records of its scenes.
-        compared: histograms by the names of their datasets, its own first; empty where it has none.
+        compared: dataset name -> histograms, its own first; empty if it has none.
         pictures: files beside the card that it shows.
     """
     rows = [row for record in made for row in record.clips]
@@ -119,7 +119,7 @@ def _split_row(split: str, found: Sequence[ClipRow], settings: Settings) -> list
 
 
 def _made_of(settings: Settings) -> str:
-    """About how many surfels scenes have and from how many views, over all splits that have some."""
+    """Return approximate numbers of surfels per scene and of their views, over all splits with scenes."""
     budgets = [each for split in settings.used_splits() for each in settings.surfel_budgets(split)]
 
     def between(numbers: Sequence[int]) -> str:
@@ -130,7 +130,7 @@ def _made_of(settings: Settings) -> str:
 
 
 def _refined(made: Sequence[Record]) -> dict[str, Any] | None:
-    """Gain of fitting the surfels to their G-buffers, means over scenes."""
+    """Return the gain of fitting surfels to their G-buffers, means over scenes."""
     found = [record.refinement for record in made if record.refinement is not None]
     if not found:
         return None
@@ -144,7 +144,7 @@ def _refined(made: Sequence[Record]) -> dict[str, Any] | None:
 
 
 def _rebuilt(found: Sequence[Figures]) -> dict[str, Any] | None:
-    """How near reconstructed surfels are to the truth, medians over scenes."""
+    """Return the errors of reconstructed surfels, medians over scenes."""
     if not found:
         return None
     psnr, degrees = (
@@ -154,7 +154,7 @@ def _rebuilt(found: Sequence[Figures]) -> dict[str, Any] | None:
 
 
 def _medians(found: Sequence[Histograms]) -> list[list[str]]:
-    """Rows of the table of histograms: title, a median a dataset, what was counted."""
+    """Return rows of the table of histograms: title, one median per dataset, counted items."""
     rows = []
     for name, measure in MEASURES.items():
         values = [median(name, each.get(name, ())) for each in found]
@@ -165,16 +165,16 @@ def _medians(found: Sequence[Histograms]) -> list[list[str]]:
 
 
 def _cell(text: str) -> str:
-    """Text in a cell of a Markdown table."""
+    """Escape text for a cell of a Markdown table."""
     return text.replace("|", "\\|")
 
 
 def index_page(title: str, rows: Sequence[ClipRow], links: Mapping[str, str]) -> str:
-    """The page, the same bytes for the same clips.
+    """Return index.html, the same bytes for the same clips.
 
     Args:
-        title: of the page.
-        rows: the clips, in the order in which they are shown at first.
+        title: title of the page.
+        rows: the clips, in their initial order.
         links: name -> file beside the page.
     """
     folder = resources.files("datagen.dataset") / "page"
@@ -191,7 +191,7 @@ def index_page(title: str, rows: Sequence[ClipRow], links: Mapping[str, str]) ->
 
 
 def tone_tables() -> dict[str, Any]:
-    """Tables that the page computes display values by: AgX from ``tron.color``, and the code of previews."""
+    """Return tables for the page's display values: AgX of ``tron.color``, and the code of previews."""
     stops = np.linspace(*AGX_LOG2_RANGE, AGX_SAMPLES + 1)
     curve = agx(np.repeat(2.0 ** stops[:, None], 3, axis=1))[:, 0]  # a grey is the same after the inset
     return {
@@ -227,19 +227,19 @@ COLUMNS = pa.schema(
 
 
 def metadata_parquet(rows: Sequence[ClipRow]) -> bytes:
-    """metadata.parquet: a row a clip, the same bytes for the same rows."""
+    """Return metadata.parquet with one row per clip, the same bytes for the same rows."""
     buffer = io.BytesIO()
     pq.write_table(pa.Table.from_pylist([row.model_dump() for row in rows], COLUMNS), buffer)
     return buffer.getvalue()
 
 
 def front_matter(settings: Settings, clips: Mapping[str, int], licences: Sequence[str | None]) -> str:
-    """YAML front matter of README.md.
+    """Return the YAML front matter of README.md.
 
     Args:
-        settings: what the dataset was made with.
-        clips: their number by split.
-        licences: of the files that it was made from; None where one has none.
+        settings: settings of the dataset.
+        clips: number of clips by split.
+        licences: licences of the source files; None for a file without one.
     """
     described = {
         "pretty_name": "TRON relighting clips",
@@ -256,7 +256,7 @@ def front_matter(settings: Settings, clips: Mapping[str, int], licences: Sequenc
 
 
 def configurations(settings: Settings, clips: Mapping[str, int]) -> list[dict[str, Any]]:
-    """Splits by configuration: those whose clips hold the same files; the first is the default one."""
+    """Group splits whose clips have the same files into configurations; the first is the default."""
     kinds: dict[tuple[bool, int], list[str]] = {}
     for split in (name for name in SHARD_SPLITS if clips.get(name)):
         recipe = settings.split(split)
@@ -271,9 +271,9 @@ def configurations(settings: Settings, clips: Mapping[str, int]) -> list[dict[st
 
 
 def licence_names(licences: Sequence[str | None]) -> str | list[str]:
-    """The Hub's names of licences, one or several; "unknown" where nobody's files are in it.
+    """Return the Hub's names of licences, one or several; "unknown" without files of others.
 
-    A dataset of procedural scenes is its maker's, who says before publishing under which licence.
+    The maker of a dataset of procedural scenes chooses its licence before publishing.
     """
     words = {"-".join((licence or "").lower().split()) for licence in licences}
     names = sorted({SHORT.get(word, word if word in LICENCES else "other") for word in words})
@@ -281,7 +281,7 @@ def licence_names(licences: Sequence[str | None]) -> str | list[str]:
 
 
 def size_category(clips: int) -> str:
-    """The Hub's words for a number of clips.
+    """Return the Hub's size category for a number of clips.
 
     >>> size_category(112), size_category(39_000)
     ('n<1K', '10K<n<100K')

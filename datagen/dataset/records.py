@@ -1,6 +1,6 @@
-"""Scenes of a dataset as data: what is to be made, and the record that says that one is finished.
+"""Scenes of a dataset as data: work items, and the record of a finished scene.
 
-Everything that is in a scene's folder is found from here; nothing here makes anything.
+This module locates all files of a scene's folder; it makes none of them.
 """
 
 from __future__ import annotations
@@ -36,9 +36,9 @@ class Work:
     """One scene to make: its split, index and name, and the number of its first shard.
 
     Attributes:
-        capture: name of the capture that it is; empty where it is synthetic.
-        photos: about how many that has.
-        relit: frames of its clips under other lights, all lights together.
+        capture: name of the capture; empty for a synthetic scene.
+        photos: approximate number of its photos.
+        relit: number of frames of its clips under other lights, over all lights.
     """
 
     split: str
@@ -51,7 +51,7 @@ class Work:
 
 
 def starts(count: int, frames: int) -> list[int]:
-    """First photos of the clips of a row of ``count``; the last clip ends with the row, and may overlap.
+    """Return the first photos of clips in a row of ``count``; the last clip ends the row and may overlap.
 
     >>> starts(12, 5), starts(4, 5)
     ([0, 5, 7], [])
@@ -63,16 +63,16 @@ def starts(count: int, frames: int) -> list[int]:
 
 
 class ClipRow(BaseModel):
-    """A clip among the others.
+    """Row of a clip in the dataset's tables.
 
     Attributes:
-        light_family: of its light.
-        contrast: class of its light. contrast_share: what that is by, the share of the light from the
-            brightest hundredth of the sphere; None where a clip does not say.
-        capture: folder of photos that it is made from; empty for synthetic scenes.
+        light_family: family of its light.
+        contrast: contrast class of its light. contrast_share: its measure, the share of the light from the
+            brightest hundredth of the sphere; None if unknown.
+        capture: folder of its photos; empty for synthetic scenes.
         exposure: factor on linear values before AgX.
-        width, height: of its frames, pixels.
-        shard: file that holds it; thumbnail: its picture beside the shards, None where there is none.
+        width, height: size of its frames, pixels.
+        shard: its shard file; thumbnail: its picture beside the shards, None without one.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -94,7 +94,7 @@ class ClipRow(BaseModel):
 
 
 class Quarantined(BaseModel):
-    """A clip that was made and is not fit for a shard."""
+    """A finished clip that must not go into a shard."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -103,7 +103,7 @@ class Quarantined(BaseModel):
 
 
 class Figures(BaseModel):
-    """Surfels against the true G-buffers of views that they were not fitted to.
+    """Errors of surfels against true G-buffers of held-out views.
 
     Attributes:
         base_color_psnr: dB, linear, each view and channel scaled by least squares.
@@ -119,18 +119,18 @@ class Figures(BaseModel):
 
 
 class ReconstructedFigures(Figures):
-    """The same of reconstructed surfels.
+    """Errors of reconstructed surfels against true G-buffers of held-out views.
 
     Attributes:
-        albedo_scale: factors a channel that brought base color to the truth's scale; None where light was
-            known. See ``datagen.sources.reconstructed``.
+        albedo_scale: factors per channel that scale base color to the truth; None if the light was known.
+            See ``datagen.sources.reconstructed``.
     """
 
     albedo_scale: tuple[float, float, float] | None = None
 
 
 class Refinement(BaseModel):
-    """Gain of a scene's surfels by a number of optimisation steps."""
+    """Errors of a scene's surfels before and after optimisation steps."""
 
     model_config = ConfigDict(extra="forbid")
 
@@ -140,14 +140,14 @@ class Refinement(BaseModel):
 
 
 class Record(BaseModel):
-    """scenes/NAME/record.json: the scene is finished, and this is what it gave.
+    """scenes/NAME/record.json: results of a finished scene.
 
     Attributes:
-        capture: name of the capture that it is; None where it is synthetic.
-        refinement: of surfels that were made from G-buffers.
-        reconstruction: of surfels that were reconstructed from pictures.
-        clips: a row each.
-        variety: histograms of the scene (``datagen.dataset.variety``); none of a capture.
+        capture: name of the capture; None for a synthetic scene.
+        refinement: errors of surfels made from G-buffers.
+        reconstruction: errors of surfels reconstructed from pictures.
+        clips: one row per clip.
+        variety: histograms of the scene (``datagen.dataset.variety``); none for a capture.
     """
 
     model_config = ConfigDict(extra="forbid")
@@ -163,22 +163,22 @@ class Record(BaseModel):
 
 
 def scene_folder(output: Path, name: str) -> Path:
-    """Folder of a scene's specification, surfels and record."""
+    """Return the folder of a scene's specification, surfels and record."""
     return output / "scenes" / name
 
 
 def clear_work(folder: Path) -> None:
-    """Remove what a finished scene needs no more from its folder."""
+    """Remove files that a finished scene no longer needs from its folder."""
     shutil.rmtree(folder / WORK, ignore_errors=True)
 
 
 def read_record(output: Path, name: str, stored: Mapping[str, int] = NOTHING) -> Record | None:
-    """The record of a finished scene; None if it has to be made (again).
+    """Read the record of a finished scene; None if it has to be made (again).
 
     Args:
         output: folder of the dataset.
-        name: of the scene.
-        stored: bytes of the shards in the dataset's store, by name: they need not be in the folder.
+        name: name of the scene.
+        stored: shard name -> bytes in the dataset's store; these need not be in the folder.
     """
     try:
         record = Record.model_validate_json((scene_folder(output, name) / RECORD_NAME).read_bytes())
@@ -195,7 +195,7 @@ def _size(path: Path) -> int | None:
 
 
 def clip_row(meta: ClipMeta, shard: str, thumbnail: str | None) -> ClipRow:
-    """The row of a clip by its metadata; style and contrast are "unknown" where these do not say."""
+    """Return the row of a clip from its metadata; missing style and contrast are "unknown"."""
     return ClipRow(
         key=meta.key,
         scene=meta.scene,

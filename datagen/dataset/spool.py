@@ -1,8 +1,8 @@
-"""Frames of several clips on disk: they come frame by frame under every light, and leave clip by clip.
+"""Frames of several clips on disk: written frame by frame under every light, read clip by clip.
 
-93 frames under 20 lights at 512 x 512 are tens of gigabytes; what is read back is what a shard stores of it.
-True G-buffers wait likewise while surfels are made from them: 290 of 800 x 800 pixels are nine gigabytes. The
-file has no name, so that nothing is left of it however the process ends.
+93 frames under 20 lights at 512 x 512 are tens of gigabytes; they are stored as in a shard. True G-buffers
+are spooled too while surfels are made from them: 290 of 800 x 800 pixels are nine gigabytes. The file has no
+name, so nothing remains of it however the process ends.
 """
 
 from __future__ import annotations
@@ -53,9 +53,9 @@ class Spool:
     """Context manager that holds the frames of ``clips`` clips.
 
     Args:
-        folder: where; made if it is missing.
-        clips: how many.
-        store: name and image -> what is written of it; by default what a shard would store.
+        folder: folder of the file, made if missing.
+        clips: number of clips.
+        store: name and image -> image to write; by default as in a shard.
     """
 
     def __init__(
@@ -93,11 +93,11 @@ class Spool:
         self._places[clip].append(places)
 
     def clip(self, number: int) -> Clip:
-        """The frames of one clip, each read when it is asked for; not beyond this block."""
+        """Return the frames of one clip, read on demand, within this block only."""
         return Clip(self, self._places[number])
 
     def read(self, place: _Place) -> np.ndarray:
-        """One image, float32."""
+        """Read one image, float32."""
         here = self._file.tell()
         self._file.seek(place.offset)
         count = int(np.prod(place.shape))
@@ -125,7 +125,7 @@ class Clip(Sequence[Frame]):
         return {name: self._spool.read(place) for name, place in self._places[index].items()}
 
     def image(self, index: int, name: str) -> np.ndarray:
-        """One member of one frame, float32."""
+        """Read one member of one frame, float32."""
         return self._spool.read(self._places[index][name])
 
     def __iter__(self) -> Iterator[Frame]:
@@ -133,7 +133,7 @@ class Clip(Sequence[Frame]):
 
 
 def stored(name: str, image: np.ndarray) -> np.ndarray:
-    """A member's image in the precision that a shard keeps; what is not finite stays so, and is found."""
+    """Return a member's image in a shard's precision; non-finite values stay, to be found later."""
     if MEMBERS[name].bytes != 2:
         return np.asarray(image, np.float32)
     bounded = np.where(np.isfinite(image), np.clip(image, -LARGEST, LARGEST), image)
@@ -141,7 +141,7 @@ def stored(name: str, image: np.ndarray) -> np.ndarray:
 
 
 def stored_guidance(guidance: Guidance) -> Frame:
-    """Members of a frame that guidance gives."""
+    """Return the members of a frame from its guidance."""
     return {name: guidance[name] for name in guidance.BUFFERS if name in MEMBERS}
 
 
@@ -150,12 +150,12 @@ MAPS = {"normal": 3, "base_color": 3, "roughness": 1, "metallic": 1, "mask": 1}
 
 
 def view_bytes(count: int, width: int, height: int) -> int:
-    """Bytes of so many views on disk."""
+    """Return the bytes of so many views on disk."""
     return count * width * height * 4 * sum(MAPS.values())
 
 
 class ViewSpool:
-    """Context manager that holds what a reconstruction learns from true G-buffers.
+    """Context manager that holds views of true G-buffers for a reconstruction.
 
     Args:
         folder: where; made if it is missing.
@@ -173,7 +173,7 @@ class ViewSpool:
         self._spool.__exit__(*raised)
 
     def passing(self, views: Iterable[GBufferView]) -> Iterator[GBufferView]:
-        """The same views, each written down on its way.
+        """Pass views through, and write each one to disk.
 
         Raises:
             TronError: the disk is full.
@@ -184,9 +184,9 @@ class ViewSpool:
             yield view
 
     def views(self) -> Sequence[View]:
-        """All that was written, each map read when it is asked for; not beyond this block.
+        """Return all written views, with maps read on demand, within this block only.
 
-        No light is on in a G-buffer, so its picture is base color.
+        A G-buffer has no light, so its picture is base color.
         """
         clip = self._spool.clip(0)
         return [
@@ -217,12 +217,12 @@ def _as_view(number: int, camera: Camera, read: Callable[[str], np.ndarray]) -> 
 
 @dataclass
 class SceneFiles:
-    """Findings of :func:`write_clips`.
+    """Result of :func:`write_clips`: shards, and clips in and out of them.
 
     Attributes:
-        shards: that were written.
-        quarantined: clips that are not fit for one.
-        made: the others, each with its first frame's members that are counted.
+        shards: written shards.
+        quarantined: clips that must not go into a shard.
+        made: the other clips, each with members of its first frame for the histograms.
     """
 
     shards: list[ShardEntry] = field(default_factory=list)
@@ -230,7 +230,7 @@ class SceneFiles:
     made: list[tuple[ClipMeta, Frame]] = field(default_factory=list)
 
     def rows(self) -> list[ClipRow]:
-        """A row a clip."""
+        """One row per clip."""
         shards = {key: entry.name for entry in self.shards for key in entry.keys}
         return [clip_row(meta, shards[meta.key], thumbnail_name(meta.key)) for meta, _ in self.made]
 
@@ -264,7 +264,7 @@ def write_clips(
 
 
 def first_bad_value(frames: Sequence[Frame]) -> str | None:
-    """First place where a clip is not finite, in words, or None: such a clip must not reach a shard."""
+    """Describe the first non-finite value of a clip, which must not reach a shard; None if all are finite."""
     for i, frame in enumerate(frames):
         for member, image in frame.items():
             bad = int((~np.isfinite(image)).sum())

@@ -1,8 +1,8 @@
-"""Variety of a dataset: histograms of its materials, lights and pictures, one frame a clip.
+"""Variety of a dataset: histograms of its materials, lights and pictures, one frame per clip.
 
-A scene's histograms are counted where it is made, from the true G-buffer and the frame beside it, and lie in
-its record; those of a dataset are their sums. A dataset that was made before is counted from its shards, as
-far as their members go.
+A scene's histograms are counted when it is made, from the true G-buffer and its frame, and stored in its
+record; the histograms of a dataset are sums over scenes. Datasets without them are counted from their shards,
+as far as the members allow.
 """
 
 from __future__ import annotations
@@ -34,9 +34,9 @@ class Measure:
     """One histogram of the report.
 
     Attributes:
-        title: with its unit, on the axis.
-        counted: what each count is.
-        edges: of the bins, ascending; what lies outside is counted in the first or the last bin.
+        title: title of the axis, with the unit.
+        counted: unit of the counts.
+        edges: edges of the bins, ascending; values outside count in the first or the last bin.
         logarithmic: whether the bins widen by a factor.
     """
 
@@ -46,7 +46,7 @@ class Measure:
     logarithmic: bool = False
 
     def count(self, values: np.ndarray) -> np.ndarray:
-        """(B,) counts of values of any shape."""
+        """Count values of any shape in the bins, (B,)."""
         inside = np.clip(np.asarray(values, np.float64).ravel(), self.edges[0], self.edges[-1])
         return np.histogram(inside, bins=np.asarray(self.edges))[0]
 
@@ -80,7 +80,7 @@ COUNTED_MEMBERS = (*_LIGHT, *_SURFACE)
 
 
 def surface_members(truth: GBufferView) -> dict[str, np.ndarray]:
-    """Members of a true G-buffer under their names in the schema, for :func:`frame_histograms`."""
+    """Return a true G-buffer's members under their names in the schema, for :func:`frame_histograms`."""
     distance = np.linalg.norm(truth.position - truth.camera.position, axis=-1)
     images = (truth.base_color, truth.roughness, truth.metallic, distance)
     return dict(zip(_SURFACE, images))
@@ -89,11 +89,11 @@ def surface_members(truth: GBufferView) -> dict[str, np.ndarray]:
 def frame_histograms(
     frame: Mapping[str, np.ndarray], camera: Camera, contrast: float | None = None
 ) -> Histograms:
-    """Histograms of one frame, those whose members are there.
+    """Count the histograms of one frame for which it has the members.
 
     Args:
         frame: members as in the schema, (H, W), (H, W, 1) or (H, W, 3), linear; ``foreground`` is among them.
-        camera: that it was seen by.
+        camera: camera of the frame.
         contrast: share of the light that comes from the brightest hundredth of the sphere, in [0, 1].
     """
     images = {name: np.asarray(frame[name], np.float64) for name in COUNTED_MEMBERS if name in frame}
@@ -120,11 +120,11 @@ def frame_histograms(
 
 
 def silhouette_length(distance: np.ndarray, seen: np.ndarray, camera: Camera) -> float:
-    """Length of the lines where a surface ends before another or before nothing, in frame widths.
+    """Return the length of depth silhouettes, in frame widths.
 
-    Inverse depth is affine in the pixel on every plane. Two neighbours are parted by a silhouette where
-    neither's plane, carried on from its own side, comes within SILHOUETTE_STEP of the other: a floor seen at
-    a grazing angle is none, however far apart its pixels are.
+    Inverse depth is affine in the pixel on every plane. A silhouette separates two neighbours if neither
+    one's plane, extrapolated from its own side, comes within SILHOUETTE_STEP of the other. So a floor at a
+    grazing angle has none, however far apart its pixels are.
 
     Args:
         distance: (H, W) from the camera, world units. seen: (H, W) bool, where there is a surface.
@@ -143,7 +143,7 @@ def silhouette_length(distance: np.ndarray, seen: np.ndarray, camera: Camera) ->
 
 
 def total(parts: Iterable[Histograms]) -> Histograms:
-    """Sum of histograms; a part with bins of another number (another version's) is left out."""
+    """Sum histograms; a part with another number of bins (from another version) is left out."""
     sums: dict[str, np.ndarray] = {}
     for part in parts:
         for name, counts in part.items():
@@ -153,7 +153,7 @@ def total(parts: Iterable[Histograms]) -> Histograms:
 
 
 def median(name: str, counts: Sequence[int]) -> float:
-    """Median of a measure by its counts, taken as even within a bin; NaN where nothing was counted."""
+    """Return the median of a measure from its counts, assumed even within a bin; NaN without counts."""
     if not any(counts):
         return float("nan")
     edges, below = np.asarray(MEASURES[name].edges), np.append(0, np.cumsum(counts))
@@ -161,7 +161,7 @@ def median(name: str, counts: Sequence[int]) -> float:
 
 
 def shard_histograms(folder: Path) -> Histograms:
-    """Histograms of a dataset by its shards alone: the first frame of every clip.
+    """Count the histograms of a dataset from its shards: the first frame of every clip.
 
     Raises:
         TronError: it is no dataset of this schema, or a shard is damaged.

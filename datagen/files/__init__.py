@@ -1,1 +1,1 @@
-"""The user's models, textures and maps, where they come from and what they may be used for."""
+"""The user's models, textures and maps, with sources and licences."""

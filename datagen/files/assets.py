@@ -1,4 +1,4 @@
-"""The catalogue of the user's assets: what each file is, where it comes from, and whether it may be used.
+"""The catalogue of the user's assets: each file with its source and licence.
 
 A catalogue is a JSON list beside the files (``catalogue.json``) or elsewhere:
 
@@ -46,10 +46,10 @@ class Asset(BaseModel):
     """One file that scenes may use.
 
     Attributes:
-        id: name by which specifications call it: the file's stem, or its path where stems collide.
+        id: its name in specifications: the file's stem, or its path if stems collide.
         path: relative to the folder, with forward slashes.
         sha256: of the file itself (a .gltf's textures are files of their own).
-        contents: all that it was made from, where it was read.
+        contents: hashes of its parts, if it was read.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -64,12 +64,12 @@ class Asset(BaseModel):
     contents: tuple[Content, ...] = ()
 
     def hashes(self) -> frozenset[str]:
-        """Hashes that it must not share with another to be another."""
+        """Hashes of the asset; two assets that share one are the same."""
         return compared(self.contents) or frozenset([self.sha256])
 
 
 class Refused(BaseModel):
-    """A model of the folder that cannot be used, and why, on one line."""
+    """A model that cannot be used, with the reason on one line."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -104,7 +104,7 @@ def find_assets(
         suffixes: what counts as an asset.
         catalogue: JSON file; None looks for catalogue.json in the folder.
         allow_unlicensed: ids to accept without a licence, or all of them.
-        names: ids to list alone; empty: all.
+        names: ids to list; empty: all.
 
     Raises:
         TronError: the folder or catalogue is missing or unreadable, nothing was found, an id is not there, or
@@ -142,16 +142,16 @@ def find_assets(
 def require_licences(
     kind: str, folder: Path, unlicensed: Mapping[str, str], allowed: Collection[str] | Literal["all"]
 ) -> None:
-    """Make sure that every file without a licence is one that the user allowed.
+    """Require that the user allowed every file without a licence.
 
     Args:
-        kind: what they are, in one word or two.
-        folder: of the files.
+        kind: name of the kind of files, one or two words.
+        folder: folder of the files.
         unlicensed: id -> path in the folder, of each without a licence.
         allowed: ids to use all the same, or all of them.
 
     Raises:
-        TronError: some are not; it names every one, the first LISTED of very many.
+        TronError: some are not allowed; it names at most LISTED of them.
     """
     missing = {} if allowed == "all" else {k: path for k, path in unlicensed.items() if k not in allowed}
     if not missing:
@@ -174,7 +174,7 @@ def find_models(
     allow_unlicensed: Collection[str] | Literal["all"] = (),
     names: Collection[str] = (),
 ) -> tuple[list[Asset], list[Refused]]:
-    """List the models of a folder that can be used, and those that cannot, each of them read once.
+    """List usable and unusable models of a folder; each is read once.
 
     A model that cannot be used is left out with a warning; asked for by name, it is an error.
 
@@ -225,7 +225,7 @@ def _contrast(path: str, _sha256: str) -> Contrast:
 
 
 def load_models(folder: Path, assets: Sequence[Asset]) -> dict[str, list[Part]]:
-    """Asset id -> its parts in the unit ball, z up; read once a process."""
+    """Load asset id -> its parts in the unit ball, z up; each is read once per process."""
     return {asset.id: _load(str(folder / asset.path), asset.up, asset.sha256) for asset in assets}
 
 
@@ -236,7 +236,7 @@ def _load(path: str, up: str, _sha256: str) -> list[Part]:
 
 
 def read_catalogue(path: Path, required: bool) -> dict[str, Entry]:
-    """Path -> entry of a catalogue; none where it is not there.
+    """Read path -> entry of a catalogue; empty if there is none.
 
     Raises:
         TronError: it cannot be read, or is ``required`` and not there.

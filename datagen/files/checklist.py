@@ -1,4 +1,4 @@
-"""Checklists of named assets: which of them are in the user's folders, and where the others are to be had.
+"""Checklists of named assets: which ones are in the user's folders, and where to get the others.
 
 A benchmark that names its maps and models has a slot for each. Nothing is downloaded: a slot that is empty is
 filled by something procedural, and the dataset says so.
@@ -24,7 +24,7 @@ _SIZE = re.compile(r"_\d+k(_hdr)?$", re.IGNORECASE)
 
 
 class NamedMap(BaseModel):
-    """A map with a slot: its name with or without its size, where it is to be had, and its licence."""
+    """A map with a slot: its name with or without its size, its source, and its licence."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -34,7 +34,7 @@ class NamedMap(BaseModel):
 
 
 class Models(BaseModel):
-    """Models with slots: so many, of any names."""
+    """A number of slots for models of any names."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -54,13 +54,13 @@ class Checklist(BaseModel):
 
 
 class StandIns(BaseModel):
-    """Named assets that something procedural stands in for, as the dataset says it.
+    """Named assets that procedural ones replace, as recorded in the dataset.
 
     Attributes:
-        title: of the checklist.
-        empty_maps: names of the maps that are not there.
-        maps, models: numbers of slots for each.
-        empty_models: models that are not there.
+        title: title of the checklist.
+        empty_maps: names of missing maps.
+        maps, models: numbers of slots.
+        empty_models: number of missing models.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -83,12 +83,12 @@ class StandIns(BaseModel):
 
 @dataclass(frozen=True)
 class Filled:
-    """A checklist held against what is there.
+    """A checklist compared with the user's files.
 
     Attributes:
-        present: maps of the list that are there, in its order.
-        missing: those that are not.
-        models: how many models are there, at most as many as the list has.
+        present: available maps of the list, in its order.
+        missing: missing maps.
+        models: number of available models, at most the number of slots.
     """
 
     checklist: Checklist
@@ -98,17 +98,17 @@ class Filled:
 
     @property
     def map_share(self) -> float:
-        """Share of the list's maps that are there."""
+        """Share of the list's maps that are available."""
         slots = len(self.checklist.maps)
         return len(self.present) / slots if slots else 1.0
 
     @property
     def model_share(self) -> float:
-        """Share of the list's models that are there."""
+        """Share of the list's models that are available."""
         return self.models / self.checklist.models.count if self.checklist.models.count else 1.0
 
     def stand_ins(self) -> StandIns:
-        """The slots as the dataset says it."""
+        """The slots in the form that the dataset records."""
         wanted = self.checklist.models.count
         return StandIns(
             title=self.checklist.title,
@@ -173,7 +173,7 @@ def read_checklist(name: str) -> Checklist:
 
 
 def filled(checklist: Checklist, maps: Sequence[Asset], models: Sequence[Asset]) -> Filled:
-    """Hold a checklist against what is there; a map of any size fills its slot.
+    """Compare a checklist with the user's files; a map of any size fills its slot.
 
     Args:
         checklist: the slots.
@@ -186,7 +186,7 @@ def filled(checklist: Checklist, maps: Sequence[Asset], models: Sequence[Asset])
 
 
 def _bare(path: str) -> str:
-    """Name of a map without folder, suffix and size, in lower case."""
+    """Return the name of a map without folder, suffix and size, in lower case."""
     name = path.rsplit("/", 1)[-1]
     name = name.rsplit(".", 1)[0] if name.lower().endswith((".hdr", ".exr")) else name
     return _SIZE.sub("", name).lower()

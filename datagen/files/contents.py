@@ -1,8 +1,7 @@
 """Contents of the user's files, by hash: two files under two names may be one model, texture or map.
 
-A model is its own file, the files that it refers to, and what comes out of them: its triangles, and each
-image on them. So a copy under another name, stored as another kind of file or dressed anew is found by what
-they share.
+A model has the hashes of its file, of the files that it refers to, of its triangles and of each image on
+them. So a copy under another name, in another format or with other textures is found by a shared hash.
 """
 
 from __future__ import annotations
@@ -31,7 +30,7 @@ _IMAGES = ("base_color", "roughness", "metallic", "normal_map")
 
 
 class Content(BaseModel):
-    """Bytes that something was made from.
+    """Hash of a part of an asset.
 
     Attributes:
         path: relative to the folder; what was decoded from a file is named behind a ``#``.
@@ -48,12 +47,12 @@ class Content(BaseModel):
 
 
 def compared(contents: Sequence[Content]) -> frozenset[str]:
-    """Hashes by which two things are told to share something."""
+    """Hashes that count as shared between two assets."""
     return frozenset(each.sha256 for each in contents if each.kind not in _UNCOMPARED)
 
 
 def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Content, ...]:
-    """Contents of a model that was read: its file, the files beside it, its triangles and its images.
+    """Return the contents of a model: its file, the files beside it, its triangles and its images.
 
     Args:
         folder: of the assets.
@@ -75,7 +74,7 @@ def model_contents(folder: Path, path: str, parts: Sequence[Part]) -> tuple[Cont
 
 
 def _references(path: Path) -> Iterator[tuple[Path, ContentKind]]:
-    """Files that a model refers to, with links followed; what is not there is left to the model's reader."""
+    """Yield the files that a model refers to, with links followed; missing ones are left to its reader."""
     named: list[tuple[str, ContentKind]] = []
     if path.suffix.lower() == ".obj":
         yield from _of_obj(path)
@@ -107,7 +106,7 @@ def _of_obj(path: Path) -> Iterator[tuple[Path, ContentKind]]:
 
 
 def texture_kind(path: Path) -> ContentKind:
-    """``plain`` for an image of one colour, such as a flat normal map; what cannot be read is a texture."""
+    """Return ``plain`` for an image of one colour, such as a flat normal map; unreadable: texture."""
     try:
         with Image.open(path, formats=_READ) as image:
             require_size(image.width, image.height)
@@ -118,14 +117,14 @@ def texture_kind(path: Path) -> ContentKind:
 
 
 def _mesh_hash(parts: Sequence[Part]) -> str:
-    """Hash of all triangles as float32, in an order of their own: how they are dressed is not in it."""
+    """Hash all triangles as float32 in a canonical order, without materials."""
     corners = [np.asarray(part.vertices, np.float32)[np.asarray(part.faces)] for part in parts]
     rows = np.concatenate(corners).reshape(-1, 9) + np.float32(0.0)
     return hashlib.sha256(np.ascontiguousarray(rows[np.lexsort(rows.T)]).tobytes()).hexdigest()
 
 
 def _images(parts: Sequence[Part]) -> list[np.ndarray]:
-    """Images on the parts, but those of a single colour."""
+    """Return the images on the parts, except images of a single colour."""
     found: dict[int, Any] = {}
     for part in parts:
         for name in _IMAGES:

@@ -1,7 +1,7 @@
-"""The user's files that scenes draw from, catalogued before any render, and the list of them by split.
+"""The user's files for scenes, catalogued before any render, and their list by split.
 
 The list, sources.json, depends on the settings and the files alone: all parts of one dataset have the same.
-Two datasets are disjoint, by hash, where no mesh, texture or map of one's, and no scene, was trained on.
+Two datasets are disjoint if, by hash, no mesh, texture, map or scene of one was trained on in the other.
 """
 
 from __future__ import annotations
@@ -50,7 +50,7 @@ class Sources:
     Attributes:
         assets: models.
         maps: files of the environments.
-        environments: the same maps as lights.
+        environments: lights of these maps.
         refused: models that were left out because they cannot be used.
     """
 
@@ -88,8 +88,8 @@ class Source(BaseModel):
     """One of the user's models, texture sets or maps.
 
     Attributes:
-        splits: that may draw it.
-        files: all that it was made from, textures of a model too.
+        splits: splits that may draw it.
+        files: all its files, textures of a model too.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -109,9 +109,9 @@ class SourceList(BaseModel):
     """Content of sources.json.
 
     Attributes:
-        seed: root of what is procedural.
-        splits: that have scenes drawn from it; none of captures, which are drawn from no seed.
-        stand_ins: for named assets, where there is a checklist.
+        seed: root of all procedural draws.
+        splits: splits with scenes drawn from the seed; none for captures.
+        stand_ins: replacements of named assets, if there is a checklist.
     """
 
     model_config = ConfigDict(frozen=True, extra="forbid")
@@ -124,14 +124,14 @@ class SourceList(BaseModel):
 
 
 def slots(settings: Settings, sources: Sources) -> Filled | None:
-    """The checklist of the settings held against their files; None without one; TronError as reading it."""
+    """Compare the settings' checklist with their files; None without one; TronError if it is unreadable."""
     if settings.checklist is None:
         return None
     return filled(read_checklist(settings.checklist), sources.maps, sources.assets)
 
 
 def require_slots(settings: Settings, sources: Sources) -> Sources:
-    """The sources without maps that the checklist does not name."""
+    """Return the sources without maps outside the checklist."""
     found = slots(settings, sources)
     if found is None:
         return sources
@@ -148,14 +148,14 @@ def require_slots(settings: Settings, sources: Sources) -> Sources:
 
 
 def tell_stand_ins(settings: Settings, sources: Sources) -> None:
-    """Warn of empty slots of the checklist, which procedural things fill."""
+    """Warn of empty slots of the checklist, which procedural assets fill."""
     found = slots(settings, sources)
     if found is not None and (found.missing or found.model_share < 1):
         log.warning("%s mode=plan lists them", found.stand_ins().sentence)
 
 
 def of_split(settings: Settings, sources: Sources, split: str) -> Sources:
-    """The sources that a split may draw: test files serve the test split alone, unless they are shared."""
+    """Return the sources of a split: test files are for the test split only, unless they are shared."""
     assets, textures, maps = sources.assets, sources.textures, sources.maps
     if not settings.share_models:
         assets = for_split(assets, split, Asset.hashes)
@@ -173,7 +173,7 @@ def of_split(settings: Settings, sources: Sources, split: str) -> Sources:
 
 
 def tell_shared(settings: Settings, sources: Sources) -> None:
-    """Log which kinds of files serve training and test both, because there are too few to hold some out."""
+    """Log the kinds of files that training and test share, because there are too few to hold some out."""
     used = settings.used_splits()
     if "test" not in used or used == ["test"]:
         return
@@ -193,7 +193,7 @@ def tell_shared(settings: Settings, sources: Sources) -> None:
 
 
 def source_list(settings: Settings, sources: Sources) -> SourceList:
-    """The files that a dataset draws from, each with the splits that may."""
+    """Return the files of a dataset, each with its splits."""
     used = settings.used_splits()
     served = {split: of_split(settings, sources, split) for split in used}
 
@@ -225,7 +225,7 @@ def source_list(settings: Settings, sources: Sources) -> SourceList:
 
 
 def read_source_list(folder: Path) -> SourceList:
-    """The list of a dataset.
+    """Read the source list of a dataset.
 
     Raises:
         TronError: there is none, or it is damaged.
@@ -254,13 +254,13 @@ def _ids(found: Sequence[Asset | TextureSet]) -> set[str]:
 
 
 def families(contents: Sequence[Collection[str]]) -> np.ndarray:
-    """Number of each thing's family, from 0 in the order of first members, (N,) int.
+    """Return the family number of each asset, from 0 in the order of first members, (N,) int.
 
-    Two things are of one family where they share a hash, or each shares one with a third: copies under other
-    names, and models that have a texture in common.
+    Two assets are in one family if they share a hash, or each shares one with a third: copies under other
+    names, and models with a common texture.
 
     Args:
-        contents: the hashes in each thing.
+        contents: the hashes of each asset.
     """
     hashes = {digest: k for k, digest in enumerate(dict.fromkeys(h for each in contents for h in each))}
     rows = [i for i, each in enumerate(contents) for _ in each]
@@ -273,14 +273,14 @@ def families(contents: Sequence[Collection[str]]) -> np.ndarray:
 
 
 def for_split(items: Sequence[Item], split: str, hashes: Callable[[Item], Collection[str]]) -> list[Item]:
-    """The things that serve a split: of every HELD_OUT families one is the test split's; few are shared.
+    """Return a split's assets: one in HELD_OUT families is for the test split; if too few, all are shared.
 
-    Validation has those of training: to hold out more would take them from it.
+    Validation uses the assets of training: holding out more would reduce training.
 
     Args:
         items: in an order that does not depend on the machine.
         split: name of the split.
-        hashes: what is in a thing.
+        hashes: function that returns the hashes of an asset.
     """
     if not separable(items, hashes):
         return list(items)
@@ -289,12 +289,12 @@ def for_split(items: Sequence[Item], split: str, hashes: Callable[[Item], Collec
 
 
 def separable(items: Sequence[Item], hashes: Callable[[Item], Collection[str]]) -> bool:
-    """True where there are families enough to hold some out."""
+    """Whether there are enough families to hold some out."""
     return len(items) > 0 and int(families([hashes(item) for item in items]).max()) + 1 >= HELD_OUT
 
 
 def require_disjoint(settings: Settings, sources: Sources) -> None:
-    """Make sure that nothing of a dataset was trained on in those that it must not meet.
+    """Require that nothing of a dataset was trained on in datasets that it must be disjoint from.
 
     Raises:
         TronError: a file of its is in what one of them trains on (named on both sides), both draw scenes of
@@ -310,7 +310,7 @@ def require_disjoint(settings: Settings, sources: Sources) -> None:
 
 
 def overlaps(own: SourceList, other: SourceList, folder: Path) -> Iterator[str]:
-    """Lines for what is shared with the splits that ``other`` trains on, one for each source and split."""
+    """Yield a line for each source and split shared with the training splits of ``other``."""
     there: dict[str, tuple[Source, str]] = {}
     for source in other.sources:
         if set(source.splits) & set(TRAINED):
@@ -336,7 +336,7 @@ def _compared(source: Source) -> list[Content]:
 
 
 def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:
-    """Scenes of a dataset whose specification is that of a scene another one trains on, a line each."""
+    """Yield a line for each scene with the same specification as a training scene of the other dataset."""
     own = dict(_scenes(output))
     for folder in others:
         trained = dict(_scenes(folder, TRAINED))
@@ -346,7 +346,7 @@ def shared_scenes(output: Path, others: Sequence[Path]) -> Iterator[str]:
 
 
 def _scenes(folder: Path, splits: Collection[str] | None = None) -> Iterator[tuple[str, str]]:
-    """Hash of each scene's specification without its place, and its name."""
+    """Yield hash (of the specification without PLACE) and name of each scene."""
     for path in sorted(folder.glob("scenes/*/spec.json")):
         try:
             spec = json.loads(path.read_bytes())

@@ -1,1 +1,1 @@
-"""Scenes as captures: what a photographer or a phone brings home, and the truth beside."""
+"""Scenes as captures: pictures by a photographer or a phone, and their truth."""

@@ -1,7 +1,7 @@
-"""What every camera model of captures can do: which scenes it is held to, and what it writes of one.
+"""Interface of the camera models of captures: their scenes, and the folders that they write.
 
-Modes ``captures`` and ``pseudo_captures`` differ in nothing else (``datagen.run.captures``). The first is a
-perfect camera (``datagen.photographs.perfect``), with ``capture.photographs`` a photographer's
+Modes ``captures`` and ``pseudo_captures`` differ only in the camera model (``datagen.run.captures``). The
+first is a perfect camera (``datagen.photographs.perfect``), with ``capture.photographs`` a photographer's
 (``datagen.photographs.phone``); the other is a phone (``datagen.photographs.pseudo_captures``).
 """
 
@@ -47,7 +47,7 @@ PHOTOGRAPHS_NAME = "photographs.json"
 
 @dataclass(frozen=True)
 class Stage:
-    """A scene before the camera.
+    """A scene ready for the camera.
 
     Attributes:
         spec, geometry: the scene and its meshes.
@@ -62,38 +62,38 @@ class Stage:
 
 
 class CameraModel(Protocol):
-    """A camera that scenes are photographed with.
+    """A camera model that photographs scenes.
 
     Attributes:
-        called: captures and views in a message.
-        folders: within output_dir, of the captures first; the last holds the recipe and what failed.
+        called: words for captures and views in messages.
+        folders: folders in output_dir, captures first; the last has the recipe and the failures.
     """
 
     called: tuple[str, str]
     folders: tuple[str, ...]
 
     def settings(self, settings: Settings) -> ViewSettings:
-        """Its own settings among all."""
+        """Return this camera model's settings."""
         ...
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """Keys that decide a capture's content, as plain values."""
+        """Return the keys that decide a capture's content, as plain values."""
         ...
 
     def scenes(self, settings: Settings) -> dict[str, int]:
-        """Split -> number of its scenes that it is held to."""
+        """Return split -> number of scenes to photograph."""
         ...
 
     def views(self, item: Work, settings: Settings) -> int:
-        """Number of a capture's views."""
+        """Return the number of a capture's views."""
         ...
 
     def bytes(self, item: Work, settings: Settings) -> int:
-        """Bytes on disk of a capture, as if nothing compressed."""
+        """Return the bytes of a capture on disk, without compression."""
         ...
 
     def shoot(self, stage: Stage, settings: Settings) -> None:
-        """Write the folders of a capture, each whole or not at all, the captures' last.
+        """Write the folders of a capture, each whole or not at all; the capture itself is last.
 
         A second run writes the same bytes.
 
@@ -102,23 +102,23 @@ class CameraModel(Protocol):
         """
 
     def require_whole(self, name: str, settings: Settings) -> None:
-        """Raise TronError unless the folders of a capture are there and can be read."""
+        """Raise TronError unless all folders of a capture exist and can be read."""
 
 
 def view_names(count: int) -> list[str]:
-    """Names of a capture's views, in order."""
+    """Return the names of a capture's views, in order."""
     return [f"view_{number:05d}" for number in range(count)]
 
 
 def held_out(cameras: Mapping[str, Camera]) -> dict[str, Camera]:
-    """Those of the views that reconstructions are judged by."""
+    """Return the held-out views, for judging reconstructions."""
     return dict(list(cameras.items())[::HELD_OUT])
 
 
 def relit_cameras(
     spec: SceneSpec, cameras: Mapping[str, Camera], settings: ViewSettings
 ) -> dict[str, Camera]:
-    """Cameras that other lights are shown to: the held-out ones of a capture, or the scene's own film."""
+    """Return the cameras of relit views: the capture's held-out ones, or the scene's clip path."""
     if settings.film_frames is None:
         return held_out(cameras)
     film = spec.cameras.film.cameras(settings.film_frames, settings.width, settings.height)
@@ -126,7 +126,7 @@ def relit_cameras(
 
 
 def relit_folders(folder: Path, name: str, families: Sequence[str]) -> list[Path]:
-    """Folders of a scene's held-out views under each of the lights, such as ``relit/test-000000_1_sun``."""
+    """Return the folders of a scene's relit views, one per light, such as ``relit/test-000000_1_sun``."""
     return [folder / f"{name}_{number}_{family}" for number, family in enumerate(families, start=1)]
 
 
@@ -141,7 +141,7 @@ def write_relit(
     """Path-trace the views and their irradiance under each of the lights, and write a capture folder of each.
 
     Args:
-        folder: the one that they share.
+        folder: parent of all folders.
         spec: the scene; names the random streams.
         geometry: its meshes.
         environments: one for each of ``settings.relights``.
@@ -181,7 +181,7 @@ def write_relit(
 
 
 def _surfaces(geometry: Geometry, cameras: Mapping[str, Camera]) -> list[dict[str, np.ndarray]]:
-    """True base color and normals of each view, zero where there is no surface."""
+    """Return true base color and normals of each view, zero off surfaces."""
     return [
         {
             "base_color": np.where(seen.valid[..., None], seen.base_color, 0),
@@ -192,10 +192,10 @@ def _surfaces(geometry: Geometry, cameras: Mapping[str, Camera]) -> list[dict[st
 
 
 def shown_with(spec: SceneSpec, environment: EnvironmentMap, frames: np.ndarray) -> float:
-    """Exposure of views under a light: the light's own; indoors, that of what covers their pixels.
+    """Return the exposure of views under a light: the light's own; indoors, metered on surfaces.
 
     Args:
-        spec: of the scene; says whether it is metered.
+        spec: the scene; it decides whether exposure is metered.
         environment: the light.
         frames: (K, H, W, 4) linear radiance and coverage.
     """
@@ -204,10 +204,10 @@ def shown_with(spec: SceneSpec, environment: EnvironmentMap, frames: np.ndarray)
 
 
 def straightened(frame: np.ndarray, where: str) -> tuple[np.ndarray, np.ndarray]:
-    """Premultiplied linear radiance and coverage (H, W, 4) -> straight radiance (H, W, 3), mask (H, W).
+    """Unpremultiply linear radiance with coverage (H, W, 4): straight radiance (H, W, 3), mask (H, W).
 
-    The tone curve bends, so colours are straightened before it: the rim of an object has the object's
-    colours, not darker ones. What is not covered is black.
+    The tone curve is not linear, so this comes before it: the rim of an object then has the object's colours,
+    not darker ones. Uncovered pixels are black.
 
     Raises:
         TronError: the frame is not finite, which the tone curve would hide.

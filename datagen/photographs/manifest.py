@@ -1,4 +1,4 @@
-"""The account of a folder of captures: which files each has, and whether they still hold what was written."""
+"""Manifest of a folder of captures: the files of each with size and hash, for verification."""
 
 from __future__ import annotations
 
@@ -37,7 +37,7 @@ class CaptureManifest(BaseModel):
 
     @classmethod
     def load(cls, folder: Path) -> CaptureManifest:
-        """Read folder/manifest.json; an empty one where there is none.
+        """Read folder/manifest.json; return an empty manifest if there is none.
 
         Raises:
             TronError: it is damaged.
@@ -55,13 +55,13 @@ class CaptureManifest(BaseModel):
             ) from error
 
     def record(self, capture: Path) -> None:
-        """Take down every file of a finished capture."""
+        """Record every file of a finished capture."""
         self.captures[capture.name] = {
             name: FileEntry(bytes=path.stat().st_size, sha256=sha256(path)) for name, path in _files(capture)
         }
 
     def holds(self, capture: Path) -> bool:
-        """Whether every file that was taken down of a capture is there and as long as it was."""
+        """Whether every recorded file of a capture exists with its recorded size."""
         sizes = {name: path.stat().st_size for name, path in _files(capture)}
         return sizes == {name: entry.bytes for name, entry in self.captures.get(capture.name, {}).items()}
 
@@ -74,7 +74,7 @@ class CaptureManifest(BaseModel):
 
 
 def capture_names(folder: Path) -> list[str]:
-    """Names of the captures in their folder, in order; what is hidden is half-written."""
+    """Return the names of the captures in their folder, in order; hidden folders are half-written."""
     found = (path.name for path in folder.iterdir() if path.is_dir() and path.name != TRACEBACKS)
     return sorted(name for name in found if not name.startswith("."))
 
@@ -86,9 +86,9 @@ def _files(capture: Path) -> Iterator[tuple[str, Path]]:
 
 
 def verify_captures(folder: Path) -> list[str]:
-    """Every problem of a folder of captures, one line each; empty when it is whole.
+    """Return every problem of a folder of captures, one line each; empty if there are none.
 
-    Finds missing and stray captures and files, cut ones, flipped bytes, and what does not decode.
+    It finds missing, stray, truncated, corrupted and undecodable files, and missing and stray captures.
     """
     try:
         manifest = CaptureManifest.load(folder)
@@ -124,7 +124,7 @@ def _changes(capture: Path, recorded: dict[str, FileEntry]) -> Iterator[str]:
 
 
 def _unreadable(capture: Path) -> Iterator[str]:
-    """Problems of reading a capture, or the picture or a map of a view."""
+    """Yield the problems of reading a capture, or a picture or map of a view."""
     try:
         ours = is_capture_folder(capture)
         views = (read_capture_folder(capture) if ours else read_blind_capture(capture)).views

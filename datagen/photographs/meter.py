@@ -1,11 +1,11 @@
-"""A camera's white balance and exposure, by which all photographs are taken (``datagen.photographs``).
+"""White balance and exposure of the camera of all photographs (``datagen.photographs``).
 
-A phone takes the light that falls on what it sees for grey, and shows what comes back as middle grey in the
-mean: dark things come out brighter than they are, white ones darker. Gains on channels of photos are gains on
-the light, so the light is what changes: base color stays what it is in the camera's colours.
+A phone assumes that the incident light on the visible surfaces is grey, and exposes their mean radiance as
+middle grey: dark things become brighter, white things darker. Gains on channels of photos equal gains on the
+light, so the light is changed and base color is kept.
 
-Only light that comes straight from its source is held grey here, while the joint fit also counts what bounces
-(``tron.reconstruction.materials.joint_fit.light_balance``): in a red room they differ.
+Here only direct light is balanced to grey; the joint fit includes bounced light
+(``tron.reconstruction.materials.joint_fit.light_balance``). In a red room they differ.
 """
 
 from __future__ import annotations
@@ -30,16 +30,16 @@ VIEWS, SPP = 8, 16
 def balanced(
     spec: SceneSpec, geometry: Geometry, environment: EnvironmentMap, settings: ViewSettings, stream: str
 ) -> tuple[EnvironmentMap, float]:
-    """The light in the colours of a camera that balances white, and the exposure that its meter sets.
+    """Return the light after white balance, and the metered exposure.
 
     Args:
         spec, geometry: the scene and its meshes.
-        environment: its light, with gains on channels that nobody balanced.
+        environment: its light before white balance.
         settings: size of the views.
         stream: name of the camera's random streams.
 
     Raises:
-        TronError: nothing that can be metered is seen.
+        TronError: no visible surface can be metered.
     """
     cameras = spec.views(VIEWS, settings.width, settings.height)
     scene = geometry.lit(environment)

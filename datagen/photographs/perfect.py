@@ -1,7 +1,7 @@
-"""A perfect camera: scenes as captures to reconstruct, path-traced views from all sides with the true maps.
+"""A perfect camera: captures of path-traced views from all sides, with true maps.
 
-What a photographer would have brought home, and what he could not: alpha, normals, materials, irradiance,
-depth and the light itself. A capture is the test split's scene of the same index; its folder appears whole
+Besides pictures, a capture has what no photographer can measure: alpha, normals, materials, irradiance, depth
+and the light. A capture is the test split's scene of the same index; its folder appears whole
 (``tron.captures.folder``).
 """
 
@@ -59,28 +59,28 @@ PHOTOGRAPHED = ("image", "mask")
 
 
 class PerfectCamera(CameraModel):
-    """Path-traced light as it is, with true maps; or a photographer's photos of it, with ``photographs``."""
+    """Path-traced radiance with true maps or, with ``photographs``, a photographer's photos of it."""
 
     called, folders = ("captures", "views"), (CAPTURES,)
 
     def settings(self, settings: Settings) -> CaptureSettings:
-        """Those of ``capture``."""
+        """Return the settings ``capture``."""
         return settings.capture
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """With the style of the test split."""
+        """Return the keys, with the style of the test split."""
         return settings.capture_recipe()
 
     def scenes(self, settings: Settings) -> dict[str, int]:
-        """Of the test split, as many as ``capture.scenes``."""
+        """Return ``capture.scenes`` scenes of the test split."""
         return {"test": settings.capture.scenes}
 
     def views(self, item: Work, settings: Settings) -> int:  # noqa: ARG002 as all cameras
-        """As many as are asked for."""
+        """Return the number of views in the settings."""
         return settings.capture.views
 
     def bytes(self, item: Work, settings: Settings) -> int:  # noqa: ARG002 as all cameras
-        """Pictures and maps of all views, the relit ones and the light."""
+        """Return the bytes of pictures and maps of all views, of relit views and of the light."""
         wanted = settings.capture
         pixels = wanted.views * wanted.width * wanted.height
         shown = wanted.views // HELD_OUT if wanted.film_frames is None else wanted.film_frames
@@ -88,7 +88,7 @@ class PerfectCamera(CameraModel):
         return relit + pixels * PIXEL_BYTES + wanted.views * 10_000 + settings.environment_height**2 * 2 * 12
 
     def shoot(self, stage: Stage, settings: Settings) -> None:
-        """One folder; where points are asked for it is written twice, the second time with them."""
+        """Write one folder; if points are wanted it is written again with them."""
         wanted, spec, geometry = settings.capture, stage.spec, stage.geometry
         folder = settings.output_dir / CAPTURES / spec.name
         photographs = taken(spec, wanted)
@@ -111,14 +111,14 @@ class PerfectCamera(CameraModel):
             write(replace(capture, points=points, point_colors=colors))
 
     def require_whole(self, name: str, settings: Settings) -> None:
-        """Points too, where they are asked for."""
+        """Raise TronError unless the folder can be read, with points if they are wanted."""
         folder = settings.output_dir / CAPTURES / name
         if read_capture_folder(folder).points is None and settings.capture.points is not None:
             raise TronError("the capture has no points yet", folder)
 
 
 def taken(spec: SceneSpec, settings: CaptureSettings) -> dict[str, Photograph]:
-    """Photograph of each training view; nothing where captures are true renders."""
+    """Return the photograph of each training view; empty if captures are true renders."""
     if not settings.photographs:
         return {}
     names = [name for number, name in enumerate(view_names(settings.views)) if number % HELD_OUT]
@@ -134,7 +134,7 @@ def captured(
     photographs: Mapping[str, Photograph] | None = None,
     exposure: float | None = None,
 ) -> Capture:
-    """The capture of a scene under a light; views are rendered when they are read, best in their order.
+    """Return the capture of a scene under a light; views are rendered on reading, fastest in order.
 
     Images are AgX of straight (not premultiplied) radiance times the exposure (the light's own where none is
     given), with anti-aliased coverage as their mask; those that ``photographs`` names are what a camera made
@@ -156,9 +156,9 @@ def captured(
 def surface_points(
     capture: Capture, count: int, spec: SceneSpec, geometry: Geometry
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About ``count`` points (N, 3) that training views see, and their colours, display space.
+    """Return about ``count`` points (N, 3) visible in training views, and their display colours.
 
-    Photographs have no map of depth: theirs is looked up in the meshes.
+    Photographs have no depth map, so their depth is traced in the meshes.
     """
     rng = generator(spec.seed, spec.split, spec.index, STREAM, "points")
     views = capture.train_views
@@ -178,7 +178,7 @@ def surface_points(
 
 
 class _Shots:
-    """Views that are rendered a group at a time, the group of the one that is asked for; the last is kept."""
+    """Views rendered on demand in groups; the last group is kept."""
 
     FIELDS = ("image", "mask", *MAPS)
 
@@ -201,7 +201,7 @@ class _Shots:
         self._rendered: list[dict[str, np.ndarray]] = []
 
     def read(self, number: int, field: str) -> np.ndarray:
-        """One field of one view, float32."""
+        """Read one field of one view, float32."""
         group, place = divmod(number, self._size)
         if group != self._group:
             first = group * self._size
@@ -224,7 +224,7 @@ class _Shots:
         return shots
 
     def _picture(self, number: int, straight: np.ndarray, mask: np.ndarray) -> np.ndarray:
-        """Display values of straight linear radiance; what is not covered is black."""
+        """Return display values of straight linear radiance; uncovered pixels are black."""
         photograph, spec = self._photographs.get(self._names[number]), self._spec
         if photograph is None:
             shown = to_display(straight, self._exposure)
@@ -239,14 +239,14 @@ class _Shots:
 
 
 def true_depth(truth: GBufferView) -> np.ndarray:
-    """(H, W) distances from camera to surface, world units; 0 where there is none."""
+    """Return distances from camera to surface (H, W), world units; 0 off surfaces."""
     return np.where(truth.valid, np.linalg.norm(truth.position - truth.camera.position, axis=-1), 0)
 
 
 def true_maps(
     geometry: Geometry, scene: mi.Scene, camera: Camera, truth: GBufferView, spp: int, seed: int
 ) -> dict[str, np.ndarray]:
-    """Maps of the pixel centres, each by its field of a view, zero where there is no surface.
+    """Return field of a view -> map at the pixel centres, zero off surfaces.
 
     Args:
         geometry, scene: the meshes, and the same lit.

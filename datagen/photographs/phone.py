@@ -1,4 +1,4 @@
-"""A phone that photographs a scene: its lens, its sensor, its tone curve, and how they were at each photo."""
+"""A phone camera: lens, sensor and tone curve, and their state in each photo."""
 
 from __future__ import annotations
 
@@ -18,11 +18,11 @@ from tron.seeds import generator
 
 @dataclass(frozen=True)
 class Phone:
-    """Lens, sensor and curve of one capture: what all photos share and what is each one's own.
+    """Lens, sensor and curve of one capture: values shared by all photos, and values per photo.
 
     Attributes:
         curve: from linear light to display values: "agx", or "srgb", clipped at white.
-        vignetting: share of light that corners lack.
+        vignetting: share of light lost in the corners.
         photographs: name of a photo -> its exposure and white balance.
         blurs: name of a photo -> its blur.
     """
@@ -35,11 +35,11 @@ class Phone:
     def photo(
         self, name: str, exposed: np.ndarray, settings: PseudoCaptureSettings, rng: np.random.Generator
     ) -> np.ndarray:
-        """Display values (H, W, 3) in [0, 1] of linear light (H, W, 3) times the capture's exposure.
+        """Take a photo: linear light (H, W, 3) times the capture's exposure -> display values in [0, 1].
 
         Args:
-            name: of the photo.
-            exposed: the light, its surroundings included.
+            name: name of the photo.
+            exposed: the exposed light, surroundings included.
             settings: of the sensor.
             rng: stream of the noise.
         """
@@ -51,7 +51,7 @@ class Phone:
         return np.clip(linear_to_srgb(np.maximum(counted, 0.0)), 0.0, 1.0)
 
     def described(self) -> dict[str, Any]:
-        """Plain values for a file: what nobody who has the photos alone knows."""
+        """Return the hidden state as plain values for a file."""
         photos = described(list(self.photographs.items()))
         for name, blur in self.blurs.items():
             photos[name] |= {
@@ -63,11 +63,11 @@ class Phone:
 
 
 def draw_phone(settings: PseudoCaptureSettings, names: Sequence[str], seed: int, *path: str | int) -> Phone:
-    """Draw the phone of a capture and the circumstances of its photos.
+    """Draw the phone of a capture and the state of each photo.
 
     Args:
-        settings: laws that they are drawn from.
-        names: of the photos.
+        settings: distributions.
+        names: names of the photos.
         seed, path: root and path of the random streams.
     """
     lens = settings.lens
@@ -97,8 +97,8 @@ class Blur:
 
     Attributes:
         spread: standard deviation of the Gaussian point spread, pixels.
-        motion: length of the straight way that the image moves while it is taken, pixels.
-        motion_deg: direction of that way in the image, from x towards y.
+        motion: length of the image's straight motion during exposure, pixels.
+        motion_deg: direction of the motion in the image, from x towards y.
     """
 
     spread: float = 0.0
@@ -108,8 +108,8 @@ class Blur:
     def kernel(self) -> np.ndarray:
         """(2 r + 1, 2 r + 1) float64 weights of sum 1, none negative, point-symmetric.
 
-        Each is the Gaussian's integral over its pixel: samples at the pixels' centres would make a spread of
-        a third of a pixel no spread at all.
+        Each weight is the Gaussian's integral over its pixel: samples at pixel centres would ignore a spread
+        of a third of a pixel.
         """
         radius = int(np.ceil(0.5 * self.motion + REACH * self.spread))
         way = 0.5 * self.motion * np.linspace(-1.0, 1.0, STEPS)
@@ -121,7 +121,7 @@ class Blur:
         return weights / weights.sum()
 
     def on(self, light: np.ndarray) -> np.ndarray:
-        """Linear light (H, W, 3) blurred, float32; beyond its edge it goes on as at the edge."""
+        """Blur linear light (H, W, 3), float32; the border is replicated."""
         kernel = self.kernel()
         if kernel.size == 1:
             return light.astype(np.float32)
@@ -129,7 +129,7 @@ class Blur:
 
 
 def vignette(width: int, height: int, corner: float) -> np.ndarray:
-    """(H, W, 1) float32 share of the light that arrives: 1 in the middle, 1 - ``corner`` in the corners."""
+    """Return the transmitted share of light (H, W, 1) float32: 1 at the centre, 1 - ``corner`` in corners."""
     x = (np.arange(width) + 0.5) / width * 2 - 1
     y = (np.arange(height) + 0.5) / height * 2 - 1
     diagonal = width**2 + height**2
@@ -138,7 +138,7 @@ def vignette(width: int, height: int, corner: float) -> np.ndarray:
 
 
 def _pixel_integrals(centres: np.ndarray, spread: float, radius: int) -> np.ndarray:
-    """(N, 2 r + 1): integrals over pixels -r to r of Gaussians at ``centres`` (N,)."""
+    """Integrate Gaussians at ``centres`` (N,) over pixels -r to r: (N, 2 r + 1)."""
     edges = np.arange(-radius, radius + 2) - 0.5
     # A point is a Gaussian much narrower than any step between places.
     below = 0.5 * (1 + erf((edges - centres[:, None]) / (np.sqrt(2) * max(spread, 1e-6))))
@@ -147,18 +147,18 @@ def _pixel_integrals(centres: np.ndarray, spread: float, radius: int) -> np.ndar
 
 @dataclass(frozen=True)
 class Photograph:
-    """Circumstances of one photo.
+    """Exposure and white balance of one photo.
 
     Attributes:
-        exposure_stops: power of two on the light that the sensor collects.
-        white_balance: (3,) gains on what it counted; that of green is 1.
+        exposure_stops: power of two on the collected light.
+        white_balance: (3,) gains on the counts; green has gain 1.
     """
 
     exposure_stops: float
     white_balance: tuple[float, float, float]
 
     def take(self, exposed: np.ndarray, settings: SensorSettings, rng: np.random.Generator) -> np.ndarray:
-        """Linear values (H, W, 3), 1 for as many electrons as the settings say -> those of the photo.
+        """Apply exposure, noise and white balance to linear values (H, W, 3); 1 is the full electron count.
 
         The variance of counted electrons is their number (shot noise), and reading them adds the same
         everywhere (Janesick 2007, "Photon Transfer"). Values may be a little negative in the dark.
@@ -170,10 +170,10 @@ class Photograph:
 
 
 def drift(count: int, settings: SensorSettings, seed: int, *names: str | int) -> list[Photograph]:
-    """Drifts of so many photos of a capture: drawn from normal laws, and centred, in the logarithm.
+    """Draw the drift of exposure and white balance over photos: normal in the logarithm, and centred.
 
     Args:
-        count: of photos.
+        count: number of photos.
         settings: standard deviations.
         seed, names: root and path of the random stream.
     """
@@ -187,7 +187,7 @@ def drift(count: int, settings: SensorSettings, seed: int, *names: str | int) ->
 
 
 def described(photographs: Sequence[tuple[str, Photograph]]) -> dict[str, dict[str, object]]:
-    """Plain values for a file beside the photos: name of a view -> how it was taken."""
+    """Return plain values for a file beside the photos: name of a view -> its state."""
     return {
         name: {
             "exposure_stops": round(taken.exposure_stops, 6),

@@ -1,4 +1,4 @@
-"""Pseudo-captures: scenes as a phone would bring them home, and the truth in a folder that nobody opens.
+"""Pseudo-captures: scenes photographed as by a phone, with the truth in separate folders.
 
     captures/NAME    photos, poses a little off, sparse points, masks where they are asked for
                      (``datagen.photographs.pseudo_captures``); nothing else
@@ -7,16 +7,16 @@
                      colours of a camera that balances white (``datagen.photographs.meter``)
     relit/NAME_K_L   the held-out views under other lights (``datagen.photographs.camera_model``)
 
-What is reconstructed from ``captures`` is judged by the others. A capture is finished when all of its folders
-are there; the photos are written last. ``captures/NAME`` is what a camera and structure from motion give:
+Reconstructions from ``captures`` are judged by the others. A capture is finished when all of its folders
+exist; the photos are written last. ``captures/NAME`` is what a camera and structure from motion give:
 
     transforms.json     nerfstudio's: intrinsics, OpenGL camera-to-world matrices
     images/NAME.jpg     8 bits (or .png)
     masks/NAME.png      8 bits, what is subject; where they are asked for
     sparse.ply          points and their colours, if some are known
 
-It has no object "tron" (``tron.captures.folder``), so that ``load_capture`` reads it as anybody's photos:
-without maps, of an exposure and a tone curve that nothing names.
+It has no object "tron" (``tron.captures.folder``), so ``load_capture`` reads it as ordinary photos: without
+maps, and with unknown exposure and tone curve.
 """
 
 from __future__ import annotations
@@ -69,30 +69,30 @@ FINER = 4
 
 
 class PhoneCamera(CameraModel):
-    """A phone whose poses are not quite known; the truth lies in a folder of its own."""
+    """A phone with inexact poses; the truth is in a folder of its own."""
 
     called, folders = ("pseudo-captures", "photos"), (CAPTURES, TRUTH)
 
     def settings(self, settings: Settings) -> PseudoCaptureSettings:
-        """Those of ``pseudo_capture``."""
+        """Return the settings ``pseudo_capture``."""
         return settings.pseudo_capture
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """With the styles of the splits that have scenes."""
+        """Return the keys, with the styles of the splits that have scenes."""
         return settings.pseudo_capture_recipe()
 
     def scenes(self, settings: Settings) -> dict[str, int]:
-        """All scenes of all splits."""
+        """Return all scenes of all splits."""
         return {split: settings.split(split).scenes for split in settings.used_splits()}
 
     def views(self, item: Work, settings: Settings) -> int:
-        """A number that each capture draws."""
+        """Return the capture's random number of views."""
         low, high = settings.pseudo_capture.views
         rng = generator(settings.seed, item.split, item.index, STREAM, "views")
         return int(rng.integers(low, high + 1))
 
     def bytes(self, item: Work, settings: Settings) -> int:
-        """Photos, true views, maps of those that are held out, and lights."""
+        """Return the bytes of photos, true views, maps of held-out views, and lights."""
         wanted, views = settings.pseudo_capture, self.views(item, settings)
         held_out = -(-views // HELD_OUT)
         pixel = views * (PHOTO_BYTES + wanted.masks + TRUE_BYTES)
@@ -101,7 +101,7 @@ class PhoneCamera(CameraModel):
         return pixel * wanted.width * wanted.height + views * 10_000 + light * (1 + len(wanted.relights))
 
     def shoot(self, stage: Stage, settings: Settings) -> None:
-        """The truth, then the photos. Frames and G-buffers are in memory together."""
+        """Write the truth, then the photos; frames and G-buffers are in memory together."""
         wanted, spec = settings.pseudo_capture, stage.spec
         names, cameras = list(stage.cameras), list(stage.cameras.values())
         seeds = [integer(spec.seed, spec.split, spec.index, STREAM, name, "path") for name in names]
@@ -125,13 +125,13 @@ class PhoneCamera(CameraModel):
         _write_photos(stage, phone, shots, buffers, exposure, settings)
 
     def require_whole(self, name: str, settings: Settings) -> None:
-        """Photos and truth."""
+        """Raise TronError unless photos and truth can be read."""
         read_blind_capture(settings.output_dir / CAPTURES / name)
         read_capture_folder(settings.output_dir / TRUTH / name)
 
 
 def before_light(frame: np.ndarray, environment: EnvironmentMap, camera: Camera) -> np.ndarray:
-    """Linear radiance (H, W, 3) of a frame (H, W, 4) before the light that is seen directly behind it."""
+    """Composite a frame (H, W, 4) over the light behind it: linear radiance (H, W, 3)."""
     rows, columns = np.nonzero(frame[..., 3] < 1)
     light = frame[..., :3].astype(np.float32)
     rays = camera.resized(FINER * camera.width, FINER * camera.height).rays()
@@ -149,11 +149,11 @@ def sparse_points(
     error: float,
     rng: np.random.Generator,
 ) -> tuple[np.ndarray, np.ndarray]:
-    """About ``count`` points (N, 3) on surfaces that photos show, and their colours in the photos.
+    """Return about ``count`` points (N, 3) on surfaces in the photos, and their colours in the photos.
 
     Args:
         cameras, buffers, photos: by the names of the photos: true cameras, true surfaces, display values.
-        count: of points, the same of each photo.
+        count: number of points, evenly over the photos.
         error: standard deviation of each coordinate, world units.
         rng: source of places and errors.
     """
@@ -175,7 +175,7 @@ def _true_capture(
     exposure: float,
     settings: Settings,
 ) -> Capture:
-    """All views as they are, in linear light; the held-out ones with their maps."""
+    """Return all views in linear light; held-out views have maps."""
     spec, geometry, cameras = stage.spec, stage.geometry, stage.cameras
     scene, views = geometry.lit(stage.environment), []
     for number, (name, camera) in enumerate(cameras.items()):
@@ -198,7 +198,7 @@ def _write_photos(
     exposure: float,
     settings: Settings,
 ) -> None:
-    """Photograph the frames and write the capture that reconstructions may see."""
+    """Photograph the frames, and write the capture for reconstructions."""
     path, spec, cameras = settings.output_dir / CAPTURES / stage.spec.name, stage.spec, stage.cameras
     wanted, noise = settings.pseudo_capture, settings.pseudo_capture.pose_noise
     photos, poses = {}, {}
@@ -222,9 +222,9 @@ def _write_photos(
 
 
 def median_distance(cameras: Mapping[str, Camera], buffers: Mapping[str, GBufferView]) -> float:
-    """Median over all pixels of the distance between camera and surface, world units; 1 where there is none.
+    """Return the median camera-to-surface distance over all pixels, world units; 1 without surfaces.
 
-    Errors of poses are a share of it, for a world has no scale of its own.
+    Errors of poses are a share of it, because a world has no scale of its own.
     """
     found = [
         np.linalg.norm(buffers[name].position[buffers[name].valid] - camera.position, axis=-1)
@@ -235,7 +235,7 @@ def median_distance(cameras: Mapping[str, Camera], buffers: Mapping[str, GBuffer
 
 
 def disturbed(camera: Camera, rotation_deg: float, translation: float, rng: np.random.Generator) -> Camera:
-    """The camera turned and moved by normal errors.
+    """Turn and move a camera by normal errors.
 
     Args:
         camera: the true one.
@@ -268,14 +268,14 @@ def write_blind_capture(
 
     Args:
         path: the folder.
-        cameras: name of a photo -> where it is said to have been taken from.
+        cameras: name of a photo -> its inexact camera.
         photos: name -> file.
         suffix: of the files, such as ".jpg".
         points: positions (N, 3), world, and display colours (N, 3).
         masks: name -> PNG file, if there are any.
 
     Raises:
-        TronError: something else lies at ``path``, or the disk says no.
+        TronError: something else is at ``path``, or the disk refuses.
     """
     if path.exists() and not (path / TRANSFORMS_NAME).is_file():
         raise TronError("folder holds something else than a capture", path, "choose another output_dir")
@@ -294,10 +294,10 @@ def write_blind_capture(
 
 
 def read_blind_capture(path: Path) -> Capture:
-    """The capture as any reader of photos sees it, at its own size.
+    """Read the capture as ordinary photos, at its own size.
 
     Raises:
-        TronError: a photo that poses name is missing or damaged, or the folder is no capture.
+        TronError: a photo in the list of poses is missing or damaged, or the folder is no capture.
     """
     capture = load_capture(path, LoadSettings(format="transforms"))
     for name, why in capture.skipped.items():

@@ -1,6 +1,6 @@
-"""Account of a dataset, written anew from its records after every run, and only where it changed.
+"""Account of a dataset, rewritten from its records after every run; unchanged files are left alone.
 
-What could not be made has a line of failures.jsonl each, and its traceback in a file.
+Each failure has a line in failures.jsonl, and its traceback in a file.
 """
 
 from __future__ import annotations
@@ -49,7 +49,7 @@ MOST_LINKS = 12
 
 
 def read_other(folder: Path | None) -> dict[str, Histograms]:
-    """Histograms of another dataset by its folder's name; by its shards where its records hold none.
+    """Read another dataset's histograms, by folder name; from its shards if its records have none.
 
     Raises:
         TronError: it is no dataset of this schema, or a shard is damaged.
@@ -72,11 +72,11 @@ def write_account(
     other: Mapping[str, Histograms],
     stored: Mapping[str, int] = NOTHING,
 ) -> int:
-    """Write failures, manifest, card, tables, sheets and page from the records; return how many failures.
+    """Write failures, manifest, card, tables, sheets and page from the records; return the failures' number.
 
     Args:
         settings, items, sources: of the dataset.
-        failed: scenes that this run tried in vain.
+        failed: scenes that failed in this run.
         other: histograms of another dataset by its name, to draw beside these; empty without one.
         stored: bytes of the shards in its store, by name.
     """
@@ -138,7 +138,7 @@ class Failure:
 
     @classmethod
     def of(cls, error: BaseException, lead: str = "") -> Failure:
-        """The failure that an exception is; ``lead`` goes before its message."""
+        """Return an exception as a failure; ``lead`` precedes its message."""
         text = str(error) if lead or isinstance(error, TronError) else f"{type(error).__name__}: {error}"
         return cls(" ".join(f"{lead}{text}".split()), "".join(traceback.format_exception(error)))
 
@@ -150,14 +150,14 @@ def record_failures(
     failed: Mapping[str, Failure],
     finished: Mapping[str, Sequence[Quarantined]],
 ) -> int:
-    """Write the list and the tracebacks of a folder; a scene made since leaves both.
+    """Write the list and the tracebacks of a folder; finished scenes leave both.
 
     Args:
-        folder: where the list lies.
-        settings: of the run; a line's command repeats them.
+        folder: folder of the list.
+        settings: settings of the run, repeated in the command of a line.
         items: scenes to account for. One that neither failed now nor is finished keeps its line.
-        failed: scenes that this run tried in vain, by name.
-        finished: scenes that are there, by name, with the clips that were made and set aside.
+        failed: scenes that failed in this run, by name.
+        finished: finished scenes by name, with their clips, good and set aside.
 
     Returns:
         The number of failures, scenes and clips.
@@ -187,7 +187,7 @@ def record_failures(
 
 
 def summary(count: int, folder: Path, logs: Path) -> str:
-    """One line that says how many failures there are and where each can be looked into."""
+    """Return a line with the number of failures and the file that lists them."""
     text = f"{count} failures, listed in {folder / LIST_NAME}"
     if (folder / TRACEBACKS).is_dir():
         text += f", tracebacks in {folder / TRACEBACKS}"
@@ -197,7 +197,7 @@ def summary(count: int, folder: Path, logs: Path) -> str:
 def _line(
     settings: Settings, item: Work, reason: str, clip: str | None = None, traceback: str | None = None
 ) -> dict[str, Any]:
-    """A scene, clip or capture with the command that tries it again."""
+    """Return the line of a scene, clip or capture, with the command that tries it again."""
     return {
         "scene": item.name,
         **({"capture": item.capture} if item.capture else {}),

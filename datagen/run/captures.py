@@ -1,4 +1,4 @@
-"""Captures of a dataset's scenes: those that are missing are made, and all of them accounted for.
+"""Make missing captures of a dataset's scenes, and account for all of them.
 
 Beside the folders of its camera a capture has its held-out views under other lights
 (``datagen.photographs.camera_model``), which are written first. It is finished when all of them are there.
@@ -48,7 +48,7 @@ CAMERAS: dict[str, CameraModel] = {"captures": PerfectCamera(), "pseudo_captures
 
 
 def make_captures(settings: Settings) -> int:
-    """Make what is missing of the captures of a mode in CAMERAS; return how many failed.
+    """Make the missing captures of a mode in CAMERAS; return the number of failures.
 
     Raises:
         TronError: wrong settings, a folder in use, made otherwise or not writable, too little space: all
@@ -97,7 +97,7 @@ def make_captures(settings: Settings) -> int:
 
 
 def captures_folder(folder: Path) -> RunFolder:
-    """A folder of captures, which holds those of one recipe."""
+    """Return the folder of captures, which has captures of one recipe only."""
     return RunFolder(folder, "captures", CONFIG_NAME)
 
 
@@ -129,7 +129,7 @@ def make_capture(item: Work, settings: Settings, sources: Sources) -> Path:
 
 
 def _finished(item: Work, settings: Settings, manifests: Mapping[Path, CaptureManifest]) -> bool:
-    """Whether the folders of a capture are there, readable, and as they were taken down if they were."""
+    """Whether a capture's folders exist, are readable, and match the manifest if they are in it."""
     if any(
         item.name in manifest.captures and not manifest.holds(folder / item.name)
         for folder, manifest in manifests.items()
@@ -149,12 +149,12 @@ def _finished(item: Work, settings: Settings, manifests: Mapping[Path, CaptureMa
 
 
 def _has_irradiance(relit: Path) -> bool:
-    """Whether all relit views of a folder have maps of it; TronError where it cannot be read."""
+    """Whether all relit views of a folder have irradiance maps; TronError if it cannot be read."""
     return all(view.has("irradiance") for view in read_capture_folder(relit).views)
 
 
 def _record_relit(folder: Path, names: Sequence[str], families: Sequence[str]) -> None:
-    """Take down the files of the relit views of some scenes, where there are any lights."""
+    """Record the files of the relit views of some scenes, if there are lights."""
     if not families:
         return
     manifest = CaptureManifest.load(folder)

@@ -1,4 +1,4 @@
-"""The Dask cluster that scenes are spread over: looked at before work starts, grown to size, waited for."""
+"""The Dask cluster for scenes: checked before work starts, scaled, and waited for."""
 
 from __future__ import annotations
 
@@ -30,7 +30,7 @@ BESIDE = {"dask.distributed.SSHCluster": "asyncssh"}
 
 
 def require_cluster(settings: Settings) -> None:
-    """Raise TronError, before any work, where the cluster's package, command, size or address is missing."""
+    """Raise TronError, before any work, if the cluster's package, command, size or address is missing."""
     options = settings.cluster
     if options is None:
         return
@@ -58,7 +58,7 @@ def require_cluster(settings: Settings) -> None:
 
 
 def _submit_command(target: str) -> str | None:
-    """The command by which a cluster class of dask-jobqueue submits jobs."""
+    """Return the command by which a cluster class of dask-jobqueue submits jobs."""
     from hydra.utils import get_object
 
     try:
@@ -69,7 +69,7 @@ def _submit_command(target: str) -> str | None:
 
 @contextmanager
 def workers(settings: Settings, most: int) -> Iterator[Any]:
-    """A `dask.distributed.Client` whose cluster has a worker; the cluster ends with the block if it is ours.
+    """Yield a `dask.distributed.Client` whose cluster has a worker; our own cluster ends with the block.
 
     Clusters that start empty are kept at `settings.workers`, at `most` the number of scenes.
 
@@ -132,7 +132,7 @@ def workers(settings: Settings, most: int) -> Iterator[Any]:
 
 
 def _close(cluster: Any) -> None:
-    """End a cluster, or a client of another's; Dask may wait for ever for a worker that is just starting."""
+    """End a cluster, or only the client of another's; Dask may wait forever for a starting worker."""
     from dask.distributed import Status
 
     try:
@@ -152,7 +152,7 @@ def _leave(client: Any, plugin: str) -> None:
 
 
 def logs_folder(settings: Settings) -> Path:
-    """Folder of the workers' logs."""
+    """Return the folder of the workers' logs."""
     return settings.output_dir / "logs"
 
 
@@ -162,7 +162,7 @@ def ours(settings: Settings) -> bool:
 
 
 def cores() -> int:
-    """Cores that this process may use."""
+    """Return the number of cores that this process may use."""
     return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
 
 
@@ -171,7 +171,7 @@ def _where(options: Mapping[str, Any]) -> str:
 
 
 def worker_count(settings: Settings, most: int) -> tuple[int, str]:
-    """Workers that the cluster will have, one at the least, and a remark where only it knows."""
+    """Return the number of workers, at least one, and a remark if only the cluster knows it."""
     if settings.cluster is None:
         return 1, ", this process"
     if settings.workers is not None:

@@ -1,4 +1,4 @@
-"""What a dataset costs before it is made, by what its source says of each scene; mode=plan."""
+"""Estimate the cost of a dataset before it is made, from its source's costs per scene; mode=plan."""
 
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ NAMED = 4  # missing scenes that the plan names
 
 
 def time_limit(item: Work, settings: Settings) -> float:
-    """Seconds that a worker may spend on a scene: what was asked for, or PATIENCE times its cost."""
+    """Return the time limit of a scene in seconds: the setting, or PATIENCE times its cost."""
     if settings.scene_timeout is not None:
         return settings.scene_timeout
     if settings.mode != "make":
@@ -35,12 +35,12 @@ def time_limit(item: Work, settings: Settings) -> float:
 
 
 def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
-    """Bytes that making scenes may take on disk: what stays, and what waits in those under way at one time.
+    """Return the maximum bytes on disk while making scenes: kept files, and scratch of concurrent scenes.
 
     Args:
         settings: the recipe.
         items: scenes to make.
-        shards: count their shards too, or the rest alone.
+        shards: whether to include their shards.
     """
     items, source = list(items), source_of(settings)
     waiting = max((source.scratch_bytes(item, settings) for item in items), default=0)
@@ -48,7 +48,7 @@ def estimate_bytes(settings: Settings, items: Iterable[Work], shards: bool = Tru
 
 
 def held_bytes(settings: Settings, items: Sequence[Work]) -> int:
-    """Bytes that scenes may take in output_dir: with a store, shards of a few at once, and what stays."""
+    """Return the maximum bytes in output_dir; with a store, only a few scenes' shards are there at once."""
     whole = estimate_bytes(settings, items)
     if settings.store is None or not items:
         return whole
@@ -58,7 +58,7 @@ def held_bytes(settings: Settings, items: Sequence[Work]) -> int:
 
 
 def project(settings: Settings) -> str:
-    """The plan as text: a table of scenes, bytes and hours by split, then what is missing and what it takes.
+    """Return the plan as text: scenes, bytes and hours by split, then missing scenes and their cost.
 
     Nothing is rendered, and nothing is written.
 
@@ -81,7 +81,7 @@ def project(settings: Settings) -> str:
 
 
 def report(settings: Settings, items: Sequence[Work], missing: Sequence[Work]) -> str:
-    """The text of a plan of these scenes, of which some are missing."""
+    """Return the text of a plan of these scenes, some of which are missing."""
     source = source_of(settings)
     costs = {item.name: source.cost(item, settings) for item in missing}
     rows = [("split", "scenes", "to make", "clips", "frames", "size", "GB", "core hours")]
@@ -127,7 +127,7 @@ def report(settings: Settings, items: Sequence[Work], missing: Sequence[Work]) -
 
 
 def _memory(settings: Settings, each: float, count: int) -> str:
-    """Memory of a worker, and how many fit where they share this machine's."""
+    """Return the memory of a worker, and how many fit into this machine if they share it."""
     text = f"about {each / 1e9:.2g} GB a worker"
     here = settings.cluster is None or settings.cluster["_target_"] == LOCAL
     there = float(os.sysconf("SC_PAGE_SIZE") * os.sysconf("SC_PHYS_PAGES"))

@@ -1,4 +1,4 @@
-"""Datasets: the scenes of the plan that are missing are made, and all of them accounted for.
+"""Make missing scenes of a dataset's plan, and account for all of them.
 
 Everything a worker leaves behind is whole (atomic writes) and depends on the plan alone, and a scene's record
 is written last. So a run may be killed at any moment and started again: it makes the scenes that have no
@@ -30,7 +30,7 @@ log = logging.getLogger(__name__)
 
 
 def make(settings: Settings) -> int:
-    """Make what is missing of a dataset of either source; return how many scenes or clips failed.
+    """Make the missing scenes of a dataset of either source; return the number of failed scenes and clips.
 
     Raises:
         TronError: wrong settings, a folder in use, made otherwise or not writable, a store that cannot be
@@ -74,7 +74,7 @@ def make(settings: Settings) -> int:
 
 
 def make_item(item: Work, settings: Settings, sources: Sources) -> Record:
-    """Make one scene or capture, send its shards to the store, and give its memory back. Runs in a worker."""
+    """Make one scene or capture, send its shards to the store, and release its memory. Runs in a worker."""
     record = source_of(settings).make(item, settings, sources)
     if settings.store is not None:
         with stage("upload"):

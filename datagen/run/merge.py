@@ -1,4 +1,4 @@
-"""mode=merge: parts of one dataset become one folder by hard links, the same bytes as one run of the whole.
+"""mode=merge: join parts of a dataset by hard links into one folder, with the bytes of a single run.
 
 A part is a folder that tron-datagen made with the same settings: by shard=i/n, or by only=[...], on this
 machine or another. Files of scenes are linked, records last; the account is written anew from the records. So
@@ -40,7 +40,7 @@ UNLINKABLE = (errno.EXDEV, errno.EPERM, errno.EMLINK, errno.ENOTSUP)
 
 
 def merge(settings: Settings) -> int:
-    """Join the parts of a dataset in output_dir; return how many scenes or clips had failed in them.
+    """Join the parts of a dataset in output_dir; return the number of failed scenes and clips.
 
     Nothing is copied where parts and output_dir lie on one file system. With a store, shards are there
     already, and the account of the whole is sent after them.
@@ -96,7 +96,7 @@ def _has(part: Path, item: Work) -> bool:
 
 
 def _require_part(part: Path, settings: Settings) -> None:
-    """Refuse a folder that is no part of the dataset that the settings describe."""
+    """Refuse a folder that is not a part of the settings' dataset."""
     mend = "give folders that tron-datagen made with these settings"
     run = RunFolder(part, "a part", CONFIG_NAME, mend)
     old = run.recipe()
@@ -113,7 +113,7 @@ def _require_part(part: Path, settings: Settings) -> None:
 
 
 def _files(parts: Sequence[Path]) -> dict[str, Path]:
-    """Files to link, by their names within the folder; TronError where two parts have one."""
+    """Return name in the folder -> file to link; TronError if two parts have the same one."""
     found: dict[str, Path] = {}
     for part in parts:
         for name in _names(part):
@@ -125,7 +125,7 @@ def _files(parts: Sequence[Path]) -> dict[str, Path]:
 
 
 def _names(part: Path) -> Iterator[str]:
-    """Names of the files of scenes in a part: neither its account nor hidden files."""
+    """Yield names of the files of scenes in a part, without its account and hidden files."""
     for folder, folders, names in os.walk(part):
         inner = Path(folder).relative_to(part)
         if inner == Path():
@@ -138,7 +138,7 @@ def _names(part: Path) -> Iterator[str]:
 
 
 def _failures(parts: Sequence[Path], unmade: set[str]) -> dict[str, Failure]:
-    """Scenes that a part tried in vain, and that none made, by name."""
+    """Return scenes that failed in a part and are finished in none, by name."""
     found: dict[str, Failure] = {}
     for part in parts:
         path = part / LIST_NAME
@@ -166,7 +166,7 @@ def _require_whole(missing: Sequence[Work]) -> None:
 
 
 def _link_all(files: Mapping[str, Path], output: Path) -> None:
-    """Link every file into a folder, records last: until its record is there, a scene does not count."""
+    """Link every file into a folder, records last, because a scene without a record does not count."""
     copied = 0
     for name in sorted(files, key=lambda name: (name.endswith(f"/{RECORD_NAME}"), name)):
         copied += link(files[name], output / name)
@@ -175,7 +175,7 @@ def _link_all(files: Mapping[str, Path], output: Path) -> None:
 
 
 def link(source: Path, target: Path) -> bool:
-    """Link a file, whole or not at all; copy it where it cannot be. Return whether it was copied."""
+    """Link a file, or copy it if linking fails, whole or not at all. Return whether it was copied."""
     target.parent.mkdir(parents=True, exist_ok=True)
     if target.is_file() and (os.path.samefile(source, target) or _same(source, target)):
         return False
@@ -195,6 +195,6 @@ def link(source: Path, target: Path) -> bool:
 
 
 def _same(source: Path, target: Path) -> bool:
-    """Whether a file was copied before: it has the size and the time of the other."""
+    """Whether a file was copied before: size and time are equal."""
     a, b = source.stat(), target.stat()
     return (a.st_size, a.st_mtime_ns) == (b.st_size, b.st_mtime_ns)

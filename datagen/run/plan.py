@@ -1,4 +1,4 @@
-"""The plan of a dataset: the list of scenes, the space they take, and which of them are there already.
+"""The plan of a dataset: its scenes, their shard numbers, and the checks of its folder.
 
 One scene is one piece of work. Its shards are its own and numbered by its index, so where a clip lands
 depends on the plan alone: not on who makes it, in which order, or what failed. A scene is finished when its
@@ -23,14 +23,14 @@ from tron.storage import write_if_changed
 
 
 def plan(settings: Settings) -> list[Work]:
-    """Every scene of the dataset, in order of split and index."""
+    """Return every scene of the dataset, in order of split and index."""
     return source_of(settings).plan(settings)
 
 
 def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
-    """The scenes named by ``only``, all if it is empty; TronError names one that lacks.
+    """Return the scenes named by ``only``, all if it is empty; TronError names an unknown one.
 
-    A name that no scene has may be a capture's: pseudo-captures are named as scenes are.
+    An unknown name may be a capture's: pseudo-captures have names of scenes.
     """
     names = list(only)
     scenes = {item.name for item in items}
@@ -48,7 +48,7 @@ def chosen(items: list[Work], only: Iterable[str]) -> list[Work]:
 
 
 def config_text(settings: Settings) -> str:
-    """config.yaml of the dataset: schema, recipe and numbers of scenes, without where and by whom."""
+    """Return config.yaml of the dataset: schema, recipe and numbers of scenes, without places and workers."""
     described = {
         "schema": SCHEMA_VERSION,
         "scenes": source_of(settings).planned(settings),
@@ -60,19 +60,19 @@ def config_text(settings: Settings) -> str:
 
 
 def config_sha256(settings: Settings) -> str:
-    """Hash of the resolved configuration, 64 hexadecimal digits; all parts of a dataset have its own."""
+    """Return the hash of the resolved configuration, 64 hexadecimal digits, the same in all parts."""
     whole = settings.model_copy(update={"shard": None})
     return hashlib.sha256(config_text(whole).encode()).hexdigest()
 
 
 def adopt(settings: Settings) -> None:
-    """Make output_dir this recipe's, or make sure that it is already; raises as :func:`require_adoptable`."""
+    """Claim output_dir for this recipe, unless it is already; raises as :func:`require_adoptable`."""
     require_adoptable(settings)
     write_if_changed(settings.output_dir / CONFIG_NAME, config_text(settings))
 
 
 def require_adoptable(settings: Settings) -> None:
-    """Make sure that output_dir is this recipe's or nobody's.
+    """Require that output_dir belongs to this recipe or to none.
 
     More scenes may be added to a dataset; any other change would mix two datasets in one folder.
 
@@ -99,7 +99,7 @@ def require_adoptable(settings: Settings) -> None:
 
 
 def _require_same_part(part: str | None, scenes: Mapping[str, int], settings: Settings) -> None:
-    """Refuse a folder that holds another part, or the same of another number of scenes."""
+    """Refuse a folder with another part, or with this part for another number of scenes."""
     if part != settings.shard:
         held = f"part {part}" if part else "a whole dataset"
         wanted = f"shard={settings.shard}" if settings.shard else "a whole dataset"
@@ -114,7 +114,7 @@ def _require_same_part(part: str | None, scenes: Mapping[str, int], settings: Se
 
 
 def clear_temporaries(output: Path) -> None:
-    """Remove what a killed run left half-written; only under the folder's lock.
+    """Remove half-written files of a killed run; only under the folder's lock.
 
     Atomic writes go to hidden files beside their targets, in folders that are all ours.
     """

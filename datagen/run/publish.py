@@ -1,9 +1,9 @@
-"""mode=publish: a finished dataset as a folder that the Hub takes: card, shards, index, pictures, Croissant.
+"""mode=publish: a finished dataset as a folder for the Hub: card, shards, index, pictures, Croissant.
 
-The card and metadata.parquet are those of the dataset; what only its maker needs (scenes, records, logs, the
-resolved configuration with its paths) stays behind. Shards are linked where one file system holds both
-folders. croissant.json is in the format of MLCommons' Croissant 1.0: shards and table as files with their
-hashes, a record a clip from the table's columns, and a record a picture from the tars.
+Card and metadata.parquet are copied; files for the maker (scenes, records, logs, the resolved configuration
+with its paths) are left out. Shards are linked if both folders are on one file system. croissant.json is in
+the format of MLCommons' Croissant 1.0: shards and table as files with their hashes, a record a clip from the
+table's columns, and a record a picture from the tars.
 """
 
 from __future__ import annotations
@@ -97,10 +97,10 @@ def publish(settings: Settings) -> None:
 
 
 def croissant(folder: Path, manifest: Manifest, described: Mapping[str, Any]) -> dict[str, Any]:
-    """The JSON-LD of a dataset: its files, a record a clip, and a record a picture of members of all clips.
+    """Return the JSON-LD of a dataset: its files, a record per clip, and a record per picture.
 
     Args:
-        folder: of the dataset. manifest: its own. described: the card's front matter.
+        folder: the dataset. manifest: its manifest. described: front matter of its card.
     """
     table, licence = folder / METADATA_NAME, described["license"]
     shards = [

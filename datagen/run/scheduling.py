@@ -1,9 +1,9 @@
-"""A task for every scene, in this process or on the cluster, with progress, times and what failed.
+"""Run a task for every scene, in this process or on the cluster, with progress, times and failures.
 
-Dask shares the scenes out, starts workers that died again, and tries their scenes up to ATTEMPTS times. Two
-things it has no word for are done in the worker itself: a scene that takes too long ends its process by
-`faulthandler`, which writes down where it hung; and after `recycle_after` scenes a worker hands its next one
-back and restarts, because Mitsuba's memory grows.
+Dask distributes the scenes, restarts dead workers, and tries their scenes up to ATTEMPTS times. The worker
+itself does two things that Dask cannot: a scene beyond its time limit ends the process by `faulthandler`,
+which writes the stack; and after `recycle_after` scenes a worker returns its next one and restarts, because
+Mitsuba's memory grows.
 """
 
 from __future__ import annotations
@@ -47,7 +47,7 @@ _made_here = 0
 
 @dataclass(frozen=True)
 class Attempt(Generic[Made]):
-    """Result of a task, or why there is none; its seconds by stage; the worker's name, as in its log.
+    """Result or failure of a task, its seconds by stage, and the worker's name, as in its log.
 
     ``fatal`` is an error that every other scene would meet too, so that the run ends by it.
     """
@@ -66,12 +66,12 @@ def make_each(
     size: Callable[[Work], int],
     unit: str,
 ) -> dict[str, Failure]:
-    """Do a task for every scene and show how far that is; return those that failed, by name.
+    """Run a task for every scene with a progress display; return the failed scenes, by name.
 
     Args:
         task, items, settings, sources: the task, the scenes and what they are made with.
-        size: the weight of a scene in the estimate of the time that is left.
-        unit: what weights count.
+        size: weight of a scene in the estimate of the remaining time.
+        unit: unit of the weights.
 
     Raises:
         TronError: the cluster does not start, its scheduler or its store is gone, or a time cannot be
@@ -100,7 +100,7 @@ def make_each(
 def attempts(
     task: Task[Made], items: Sequence[Work], settings: Settings, sources: Sources
 ) -> Generator[tuple[Work, Attempt[Made]], None, None]:
-    """Scenes as they are finished, in any order."""
+    """Yield scenes when they are finished, in any order."""
     if settings.cluster is None:
         for item in items:
             yield item, _attempt(task, settings, sources, item)
@@ -147,7 +147,7 @@ def _by_workers(
 
 
 def _attempt(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
-    """Do a task; whatever goes wrong is an outcome: one scene's failure is not the run's."""
+    """Run a task; return any error as an outcome, because one scene's failure must not end the run."""
     fatal = None
     with clocked() as seconds:
         try:
@@ -161,7 +161,7 @@ def _attempt(task: Task[Made], settings: Settings, sources: Sources, item: Work)
 
 
 def _in_worker(task: Task[Made], settings: Settings, sources: Sources, item: Work) -> Attempt[Made]:
-    """The same in a worker, whose log tells of it, within the time limit of a scene."""
+    """Run a task in a worker, with its log, within the time limit of a scene."""
     from dask.distributed import Reschedule, Status, get_worker
 
     global _made_here
@@ -191,7 +191,7 @@ def _in_worker(task: Task[Made], settings: Settings, sources: Sources, item: Wor
 
 @contextmanager
 def _limited(stack: Path, seconds: float, end: bool) -> Iterator[None]:
-    """Write where the block hangs after so long, and end this process if asked to: its nanny starts another.
+    """Write the stack if the block exceeds its limit; optionally end this process, for its nanny to restart.
 
     `faulthandler` does so from a thread of its own, even where native code holds Python's lock.
     """
@@ -206,7 +206,7 @@ def _limited(stack: Path, seconds: float, end: bool) -> Iterator[None]:
 
 
 def _stack_file(settings: Settings, item: Work) -> Path:
-    """File that is there while a worker makes a scene, and says where it hung if it did."""
+    """Return the file that exists while a worker makes a scene, and has the stack if it hung."""
     return logs_folder(settings) / f"{item.name}.stack"
 
 

@@ -1,7 +1,7 @@
-"""The object store that shards leave output_dir for, as soon as they are whole.
+"""The object store to which finished shards move from output_dir.
 
 Records stay in output_dir. A scene is finished when its record is there and each of its shards is in the
-folder or, with its bytes, in the store; what still lies in the folder is sent when the command is given
+folder or, with its bytes, in the store; shards that remain in the folder are sent when the command is run
 again.
 """
 
@@ -23,7 +23,7 @@ log = logging.getLogger(__name__)
 
 
 class StoreError(TronError):
-    """The store does not take what is sent, nor would it the next."""
+    """The store refuses shards, and would refuse the next ones too."""
 
 
 class Store:
@@ -38,7 +38,7 @@ class Store:
 
     @classmethod
     def of(cls, settings: Settings) -> Store | None:
-        """The store that the settings name, if it can be written; TronError where it cannot."""
+        """Return the settings' store; TronError if it cannot be written."""
         if settings.store is None:
             return None
         store = cls(settings.store)
@@ -46,14 +46,14 @@ class Store:
         return store
 
     def shards(self) -> dict[str, int]:
-        """Bytes of the shards that are there, by name."""
+        """Return shard name -> bytes in the store."""
         return {name: size for name, size in self._folder.sizes().items() if name.endswith(".tar")}
 
     def send(self, output: Path, record: Record) -> None:
-        """Send a finished scene's previews and shards; these leave output_dir, each when it has arrived.
+        """Send a finished scene's previews and shards; each shard leaves output_dir when it has arrived.
 
         Raises:
-            StoreError: the store cannot be written. What has not left is sent the next time.
+            StoreError: the store cannot be written. Remaining shards are sent the next time.
         """
         for name in _previews(record):
             if (output / name).is_file():
@@ -65,7 +65,7 @@ class Store:
                     (output / name).unlink()
 
     def empty(self, output: Path, items: Iterable[Work]) -> None:
-        """Send what finished scenes still have in output_dir; raises as :meth:`send`."""
+        """Send the remaining shards of finished scenes in output_dir; raises as :meth:`send`."""
         waiting = {path.name for path in output.glob("*.tar")}
         stored = self.shards() if waiting else {}
         for item in items if waiting else ():
@@ -74,7 +74,7 @@ class Store:
                 self.send(output, record)
 
     def finish(self, settings: Settings) -> None:
-        """Send the account, the manifest last; a part's stays, for mode=merge sends that of the whole."""
+        """Send the account, the manifest last; a part sends none, because mode=merge sends the whole."""
         if settings.shard is not None:
             return
         output = settings.output_dir

@@ -1,4 +1,4 @@
-"""Every problem of a dataset folder: of its shards, of the scenes that they need, and of its captures."""
+"""Find every problem of a dataset folder: in its shards, in their scenes, and in its captures."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""The log that a Dask worker writes: what its scenes said, and where native code crashed."""
+"""Log of a Dask worker: messages of its scenes, and stacks of crashes in native code."""
 
 from __future__ import annotations
 
@@ -16,11 +16,11 @@ FORMAT = "%(asctime)s %(levelname)s %(name)s: %(message)s"
 
 
 class WorkerLog(WorkerPlugin):
-    """A file of each worker's log in a folder, named for the worker; one that is replaced goes on in it.
+    """Log file of each worker in a folder, named for the worker; its replacement continues the file.
 
     Args:
-        folder: made where it is missing.
-        level: that of the command.
+        folder: made if missing.
+        level: log level of the command.
         ours: the worker ends with the command, so what Dask says in it, also while it ends, is for the log
             and not for the command's terminal.
     """
@@ -32,7 +32,7 @@ class WorkerLog(WorkerPlugin):
         self._ours = ours
 
     def setup(self, worker: Any) -> None:
-        """Begin to write; Dask calls this in every worker that is there or comes."""
+        """Begin to write; Dask calls this in every present and future worker."""
         self._folder.mkdir(parents=True, exist_ok=True)
         path = self._folder / f"worker-{re.sub(r'[^0-9A-Za-z.-]+', '-', str(worker.name))}.log"
         self._stream = path.open("a")

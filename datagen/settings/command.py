@@ -1,4 +1,4 @@
-"""The settings of ``tron-datagen``: what every key means, and what it may be."""
+"""The settings of ``tron-datagen``, with their ranges and checks."""
 
 from __future__ import annotations
 
@@ -388,7 +388,7 @@ class Settings(ScaleSettings):
     def _judge_what_is_made(
         cls, value: Any, handler: ValidatorFunctionWrapHandler, info: ValidationInfo
     ) -> SplitSettings:
-        """A split without scenes may say what it likes; captures have the test split's style."""
+        """Check used splits only; captures have the test split's style."""
         captures = info.data.get("mode") == "captures"
         made = info.field_name == "test" if captures else not _without_scenes(value)
         if made or not isinstance(value, Mapping | SplitSettings):
@@ -422,11 +422,11 @@ class Settings(ScaleSettings):
         return self
 
     def split(self, name: str) -> SplitSettings:
-        """The settings of one split; of captures, how large and long its clips are."""
+        """Return the settings of one split; for captures, the size and length of its clips."""
         return OF_SOURCE[self.source].split(self, name)
 
     def estimation(self, split: str, scene: int = 0, light: int = 0) -> Estimation:
-        """Estimation of the light on the surfels, of the clip of a scene under light number ``light``."""
+        """Return the estimation of a clip's light on the surfels, for light number ``light``."""
         chosen = {name: getattr(self, name) for name in ESTIMATED}
         draw = generator(self.seed, split, scene, "rays")
         rays = self.split(split).rays_of(light, lambda count: draw.permutation(count))
@@ -436,14 +436,14 @@ class Settings(ScaleSettings):
         return Estimation.model_validate(chosen | {name: getattr(quality, name) for name in OF_FRAMES})
 
     def surfel_budgets(self, split: str) -> list[SurfelBudget]:
-        """Surfels of a split's scenes and their views: numbers given, else by each size of pictures."""
+        """Return surfel budgets of a split's scenes: the given numbers, else one per size of pictures."""
         given = {name: getattr(self, name) for name in SurfelBudget._fields}
         chosen = {name: value for name, value in given.items() if value != AUTO}
         pictures = self.split(split).pictures
         return [surfels_by_pixels(width * height)._replace(**chosen) for width, height in pictures]
 
     def surfel_budget(self, split: str, scene: int = 0) -> SurfelBudget:
-        """That of one scene, which draws one of the sizes.
+        """Return the surfel budget of one scene, which draws one of the sizes.
 
         Its surfels are then larger than the pixels of some windows and smaller than those of others.
         """
@@ -452,25 +452,25 @@ class Settings(ScaleSettings):
         return budgets[drawn]
 
     def used_splits(self) -> list[Split]:
-        """The splits that have scenes; of captures, those that may have some."""
+        """Return the splits with scenes; for captures, the splits that may have some."""
         return OF_SOURCE[self.source].used_splits(self)
 
     def light_families(self) -> list[Family] | None:
-        """The families that ``any`` chooses from; None: the usual ones."""
+        """Return the families for ``any``; None: the usual ones."""
         if self.families is not None:
             return list(self.families)
         return ["hdri"] if self.environments is not None else None
 
     def recipe(self) -> dict[str, Any]:
-        """Keys that decide a scene's content, plain values: not where it goes, who makes it or how many."""
+        """Return the keys that decide a scene's content, as plain values: no places, workers or counts."""
         return OF_SOURCE[self.source].recipe(self)
 
     def capture_recipe(self) -> dict[str, Any]:
-        """Keys that decide a capture's content, as plain values."""
+        """Return the keys that decide a capture's content, as plain values."""
         return self.model_dump(mode="json", include=CAPTURED)
 
     def pseudo_capture_recipe(self) -> dict[str, Any]:
-        """Keys that decide a pseudo-capture's content, as plain values; of the splits that have scenes."""
+        """Return the keys that decide a pseudo-capture's content, as plain values; used splits only."""
         splits = dict.fromkeys(self.used_splits(), OF_A_SCENE)
         shared = {key: True for key in CAPTURED if key not in ("capture", "test")}
         values = self.model_dump(mode="json", include={**shared, **splits, "pseudo_capture": True})
@@ -478,10 +478,10 @@ class Settings(ScaleSettings):
 
 
 class KeysOfSynthetic:
-    """What keys mean for scenes that are drawn from seeds, split by split: ``captured`` says nothing."""
+    """Meaning of the keys for scenes drawn from seeds; ``captured`` is ignored."""
 
     def require(self, settings: Settings) -> None:
-        """Raise ValueError where a split cannot be drawn, or a key is of captures or of datasets alone."""
+        """Raise ValueError if a split cannot be drawn, or a key is for captures or datasets only."""
         if settings.captures is not None:
             raise ValueError("captures is of source=captured: give source=captured, or leave it out")
         if settings.mode in ("captures", "pseudo_captures"):
@@ -511,7 +511,7 @@ class KeysOfSynthetic:
             raise ValueError("objects must be [least, greatest] with 1 <= least <= greatest")
 
     def split(self, settings: Settings, name: str) -> SplitSettings:
-        """As it is typed; the test split has lights of its own where none were."""
+        """Return the split as typed; the test split has its own default lights."""
         chosen = getattr(settings, name)
         if name == "test" and not chosen.lights:
             usual = TEST_LIGHTS if settings.environments is None else ["any"] * len(TEST_LIGHTS)
@@ -519,11 +519,11 @@ class KeysOfSynthetic:
         return chosen
 
     def used_splits(self, settings: Settings) -> list[Split]:
-        """Those with scenes."""
+        """Return the splits with scenes."""
         return [name for name in SPLITS if self.split(settings, name).scenes]
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """All keys but those of captures and of the run; of the splits that have scenes.
+        """Return all keys except the keys of captures and of the run; only splits with scenes.
 
         Surfels and their views are numbers, split by split: another law of them is another recipe.
         """
@@ -547,10 +547,10 @@ class KeysOfSynthetic:
 
 
 class KeysOfCaptured:
-    """What keys mean for folders of photos: ``captures`` and ``captured`` say what is made of them."""
+    """Meaning of the keys for folders of photos, which ``captures`` and ``captured`` describe."""
 
     def require(self, settings: Settings) -> None:
-        """Raise ValueError without captures, or where a key is of synthetic scenes."""
+        """Raise ValueError without captures, or if a key is for synthetic scenes."""
         if settings.captures is None:
             raise ValueError("source=captured needs captures=DIR, a folder with a capture a sub-folder")
         if settings.mode not in ("make", "plan", "validate", "merge", "publish"):
@@ -563,19 +563,19 @@ class KeysOfCaptured:
                 raise ValueError(f"{key} is of source=synthetic: leave it out with source=captured")
 
     def split(self, settings: Settings, name: str) -> SplitSettings:
-        """How large and long its clips are; no scene of it is drawn."""
+        """Return the size and length of its clips; no scene is drawn."""
         wanted = settings.captured
         size = {key: getattr(wanted, key) for key in ("width", "height", "guidance_spp")}
         frames = 1 if name.endswith(RELIT) else wanted.frames
         return SplitSettings(scenes=0, lights=["any"], frames=frames, **size)
 
     def used_splits(self, settings: Settings) -> list[Split]:
-        """Those that captures may be in."""
+        """Return the splits that captures may be in."""
         wanted = settings.captured
         return [name for name in SPLITS if wanted.split_by_name or getattr(wanted.shares, name)]
 
     def recipe(self, settings: Settings) -> dict[str, Any]:
-        """The keys of captures and of both sources, without places and seeds that follow from others."""
+        """Return the keys of captures and of both sources, without places and derived seeds."""
         seeded = {"reconstruction": {"seed", "checkpoint_every"}, "light": {"seed"}}
         places = dict.fromkeys(("names", "relit", "truth", "reconstructed"), True)
         values = settings.model_dump(
@@ -601,7 +601,7 @@ def _without_scenes(split: Any) -> bool:
 
 
 def _first_difference(name: str, value: Any, default: Any) -> str:
-    """Dotted key, as it is typed, of the first setting below ``name`` that is not the default's."""
+    """Return the dotted key, as typed, of the first non-default setting below ``name``."""
     if not isinstance(value, BaseModel) or not isinstance(default, BaseModel):
         return name
     given, shipped = (leaves({name: each.model_dump(mode="json")}) for each in (value, default))
@@ -609,7 +609,7 @@ def _first_difference(name: str, value: Any, default: Any) -> str:
 
 
 def part_of(items: Sequence[Item], shard: str | None) -> list[Item]:
-    """The items that ``shard=i/n`` makes: i - 1, i - 1 + n, ...; all of them without it.
+    """Return the items of ``shard=i/n``: i - 1, i - 1 + n, ...; all without it.
 
     Raises:
         TronError: there are fewer items than parts, so that some would be empty.

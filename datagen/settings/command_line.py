@@ -1,4 +1,4 @@
-"""The command that makes a dataset, as it would be typed."""
+"""The command that makes a dataset, as typed."""
 
 from __future__ import annotations
 
@@ -16,7 +16,7 @@ from tron.run_folder import leaves
 
 
 def command_line(settings: Settings, output_dir: str, only: Sequence[str] = (), machine: bool = True) -> str:
-    """The command that makes a dataset: every key that differs from the shipped configuration, in full.
+    """Return the command that makes a dataset, with every key that differs from the shipped configuration.
 
     It does not lean on recipes, whose content may change. ``output_dir`` and ``only`` are the caller's;
     without ``machine`` it leaves out what decides nothing of the content: cluster and workers.
@@ -63,7 +63,7 @@ def _plain(recipe: DictConfig) -> dict[str, Any]:
 
 
 def _prior_group(settings: Settings) -> list[str]:
-    """The override that chooses the prior, where it is a shipped one and not the default."""
+    """Return the override that chooses the prior, if it is shipped and not the default."""
     target = settings.captured.prior["_target_"]
     if target == CapturedSettings().prior["_target_"]:
         return []
@@ -87,7 +87,7 @@ def _folded(wanted: Mapping[str, Any], defaults: Mapping[str, Any]) -> dict[str,
 
 
 def _hydra(value: Any) -> str:
-    """A value in the grammar of Hydra's overrides."""
+    """Format a value in the grammar of Hydra's overrides."""
     if isinstance(value, Mapping):
         return "{" + ",".join(f"{name}:{_hydra(item)}" for name, item in value.items()) + "}"
     if isinstance(value, str):

@@ -1,4 +1,4 @@
-"""The settings of one split of a dataset, and of what the surfels of its scenes are made from."""
+"""The settings of one split of a dataset, and of the source of its scenes' surfels."""
 
 from __future__ import annotations
 
@@ -15,7 +15,7 @@ Rays = Annotated[int, Field(ge=2, multiple_of=2)] | Literal["preview", "final"]
 
 
 class SplitSettings(SettingsModel):
-    """One split: how many scenes of which kind, and how they are rendered."""
+    """One split: number and kind of its scenes, and their rendering."""
 
     scenes: int = Field(ge=0, le=1_000_000, description="Number of scenes.")
     style: (
@@ -122,7 +122,7 @@ class SplitSettings(SettingsModel):
         return [(width, round(width * self.height / self.width)) for width in self.window_of or [self.width]]
 
     def rays_of(self, light: int, order: Callable[[int], np.ndarray]) -> Rays:
-        """What ``guidance_spp`` says of the clip under light number ``light``.
+        """Return ``guidance_spp`` for the clip under light number ``light``.
 
         Args:
             order: a number of things -> an order of theirs that the scene drew, so that neither its style
@@ -157,7 +157,7 @@ class SplitSettings(SettingsModel):
         return value
 
     def style_of(self, index: int) -> StyleChoice:
-        """Style of the scene of that number; counts begin anew behind the last of them, as lists do."""
+        """Return the style of scene number ``index``; styles and counts repeat after the last."""
         if isinstance(self.style, dict):
             ends = np.cumsum(list(self.style.values()))
             return list(self.style)[int(np.searchsorted(ends, index % ends[-1], side="right"))]
@@ -169,7 +169,7 @@ PriorName = Literal["ground_truth", "joint"]
 
 
 class SurfelSources(SettingsModel):
-    """Shares of the scenes by what their surfels are made from; the name of one alone gives it all."""
+    """Shares of the scenes by source of their surfels; a single name gives that source all scenes."""
 
     gbuffers: float = Field(
         default=1.0,
@@ -197,14 +197,14 @@ class SurfelSources(SettingsModel):
         return self
 
     def of(self, seed: int, split: str, index: int) -> Source:
-        """Source of a scene's surfels, a function of root seed, split and index alone."""
+        """Return the source of a scene's surfels, which depends only on root seed, split and index."""
         total = self.gbuffers + self.reconstruction
         drawn = generator(seed, split, index, "surfels_from").random() * total
         return "reconstruction" if drawn < self.reconstruction else "gbuffers"
 
 
 class SurfelReconstruction(SettingsModel):
-    """Reconstruction of a scene's surfels from its own views, path-traced under one of its lights."""
+    """Settings: reconstruct a scene's surfels from its own views, path-traced under one of its lights."""
 
     prior: PriorName = Field(
         default="ground_truth",

@@ -1,4 +1,4 @@
-"""Surfels by pixels: how many a scene has, and what they are made from, by the frames that are made of it.
+"""Surfel budget of a scene: numbers of surfels and views that suit the size of its frames.
 
 What surfels blur is most of a large frame's error, not noise: with 20,000 of them no denoiser brings a frame
 of 512 x 512 beyond 31.1 dB; with 60,000 it is 32.4 (a prototype on six scenes at b7bbe91). What this law
@@ -30,7 +30,7 @@ class SurfelBudget(NamedTuple):
 
     @property
     def view_pixels(self) -> int:
-        """Pixels of one view."""
+        """Number of pixels of one view."""
         return self.view_width * self.view_height
 
 
@@ -47,7 +47,7 @@ STEPS = (100, 0.5)
 
 
 def surfels_by_pixels(pixels: int) -> SurfelBudget:
-    """What suits frames of so many pixels.
+    """Return the budget for frames of so many pixels.
 
     >>> surfels_by_pixels(512 * 512)
     SurfelBudget(surfels=100000, views=32, view_width=384, view_height=384, refine_steps=400)

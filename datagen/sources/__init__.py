@@ -1,4 +1,4 @@
-"""Where clips come from: synthetic scenes and captures."""
+"""Sources of clips: synthetic scenes and captures."""
 
 from __future__ import annotations
 
@@ -12,5 +12,5 @@ SOURCES: dict[str, Source] = {"synthetic": SyntheticSource(), "captured": Captur
 
 
 def source_of(settings: Settings) -> Source:
-    """The source that the settings name."""
+    """Return the settings' source."""
     return SOURCES[settings.source]

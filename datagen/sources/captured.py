@@ -1,4 +1,4 @@
-"""Captures as scenes of a dataset: each one's surfels and light, then its clips, and at last its record."""
+"""Captures as scenes of a dataset: find surfels and light, then make clips, and last the record."""
 
 from __future__ import annotations
 
@@ -49,10 +49,10 @@ CAPTURE_STEP, CAPTURE_PIXEL = 0.12, 4e-5
 
 
 class CapturedSource(Source):
-    """Folders of photos, each a scene: reconstructed and lit, its photos are the truth."""
+    """Source of scenes from folders of photos: the reconstruction is lit, and the photos are the truth."""
 
     def plan(self, settings: Settings) -> list[Work]:
-        """A scene a capture, in the split that its name or a draw puts it in."""
+        """Return one scene per capture, in a split by its name or by a draw."""
         photos = find_captures(settings)
         if settings.captured.split_by_name:
             splits = split_by_name(list(photos))
@@ -72,7 +72,7 @@ class CapturedSource(Source):
         return items
 
     def planned(self, settings: Settings) -> dict[str, Any]:
-        """Split -> names of its captures."""
+        """Return split -> names of its captures."""
         found: dict[str, list[str]] = {}
         for item in self.plan(settings):
             found.setdefault(item.split, []).append(item.capture)
@@ -81,7 +81,7 @@ class CapturedSource(Source):
     def require_same(
         self, run: RunFolder, before: dict[str, Any], scenes: Mapping[str, Any], settings: Settings
     ) -> None:
-        """Refuse other captures too: one more would move others between splits."""
+        """Refuse other captures too: adding one would move others between splits."""
         run.require(settings.recipe(), before)
         planned = self.planned(settings)
         if scenes != planned:
@@ -94,7 +94,7 @@ class CapturedSource(Source):
             )
 
     def ready(self, settings: Settings) -> None:
-        """Refuse a prior that cannot be made and reconstructions that cannot be taken over."""
+        """Refuse a prior that cannot be made, and reconstructions that cannot be reused."""
         if named_by_split(settings):
             log.warning(
                 "captures are named by split, and the shares put them elsewhere: "
@@ -108,19 +108,19 @@ class CapturedSource(Source):
         return make_capture(item, settings)
 
     def clips(self, item: Work, settings: Settings) -> int:
-        """As many as its photos and relit views are cut into, about."""
+        """Return the approximate number of clips of its photos and relit views."""
         return photo_clips(item, settings) + item.relit
 
     def frames(self, item: Work, settings: Settings) -> int:
-        """Frames of those."""
+        """Return the number of frames of these clips."""
         return photo_clips(item, settings) * settings.captured.frames + item.relit
 
     def surfels(self, item: Work, settings: Settings) -> int:  # noqa: ARG002 as all sources
-        """As many as the reconstruction may have."""
+        """Return the maximum number of surfels of the reconstruction."""
         return settings.captured.reconstruction.radiance.density.most
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
-        """Steps, none where a reconstruction is taken over, and guidance; larger photos take longer."""
+        """Return the cost of steps (none for a reused reconstruction) and of guidance at the photos' size."""
         captured = settings.captured
         how = captured.reconstruction
         steps = how.steps_scaler * (how.radiance.steps + how.materials.steps)
@@ -131,13 +131,13 @@ class CapturedSource(Source):
         return SceneCost(seconds, self.kept_bytes(settings, [item]), 0.0)
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
-        """Its checkpoint, and frames of all its photos, until its clips are written."""
+        """Return the bytes of its checkpoint, and of frames of all photos until the clips are written."""
         frame = settings.captured.width * settings.captured.height * spooled_bytes(settings, item.split)
         return self.surfels(item, settings) * CHECKPOINT_BYTES + item.photos * frame
 
 
 def photo_clips(item: Work, settings: Settings) -> int:
-    """Clips that a capture's photos are cut into: what is held out breaks their row."""
+    """Return the number of clips of a capture's photos; held-out photos interrupt the row."""
     frames, every, clips = settings.captured.frames, settings.captured.photos.test_every, 0
     last = item.photos
     if every:

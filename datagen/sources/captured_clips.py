@@ -1,4 +1,4 @@
-"""Clips of a capture: photos in a row, and what its surfels show from their places in the capture's light."""
+"""Clips of a capture: consecutive photos, and guidance of its surfels from their cameras in its light."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Box = tuple[float, float, float, float]
 def made_clips(
     item: Work, settings: Settings, capture: Capture, found: Found, surfels: CapturedSurfels
 ) -> Iterator[list[tuple[ClipMeta, Sequence[Frame]]]]:
-    """Clips of a capture with their frames, which are read when they are asked for, within the block.
+    """Yield clips of a capture; their frames are read on demand, within the block only.
 
     Each frame holds the schema's members: guidance in the capture's own light, linear, and the photo as rgb,
     display values, or with ``captured.linear`` linear light on the scale of the guidance.
@@ -82,7 +82,7 @@ def made_clips(
 
 
 def usable_rows(item: Work, settings: Settings, capture: Capture) -> list[list[View]]:
-    """Photos in rows that are long enough for a clip.
+    """Return rows of photos that are long enough for a clip.
 
     Raises:
         TronError: there are none, or a photo of them is smaller than a frame.
@@ -107,7 +107,7 @@ def _film(
     views: Sequence[View],
     spool: Spool,
 ) -> tuple[list[Camera], float]:
-    """Put every photo and its guidance into the spool; their cameras, and the exposure of the guidance."""
+    """Write every photo and its guidance to the spool; return cameras, and the exposure of the guidance."""
     wanted = settings.captured
     # A subject without its surroundings is in front of black, in photos and guidance alike.
     alone = any(view.has("mask") and not view.has("sky_mask") for view in views)
@@ -131,11 +131,11 @@ def _film(
 
 
 def light_ratio(photo: Photo, lit: np.ndarray, seen: np.ndarray) -> np.ndarray:
-    """(N,) logarithms of what AgX makes a photo of, over ``lit``, at some of the pixels that show surfaces.
+    """Return log ratios (N,) of photo radiance, by inverse AgX, over ``lit`` at some surface pixels.
 
     Training and evaluation look at guidance through AgX, at photos as they are. So the exposure that makes
-    guidance as bright as the photos is measured against light that AgX would show as them, whatever curve
-    they went through.
+    guidance as bright as the photos is measured against radiance that AgX would display as the photos,
+    whatever their real tone curve.
 
     Args:
         photo: the truth.
@@ -170,12 +170,12 @@ class LitSurfels:
     contrast: tuple[str, float]
 
     def view(self, camera: Camera, name: str, background: Sequence[float] | None = None) -> Guidance:
-        """Guidance of one view, by its name; ``background`` as of ``Illumination.render``."""
+        """Trace the guidance of one view, by its name; ``background`` as in ``Illumination.render``."""
         seed = integer(self.settings.seed, *self.streams, "frame", name, "guidance")
         return self.light.render(camera, seed, background)
 
     def frame(self, guidance: Guidance, camera: Camera) -> Frame:
-        """Members of one view that surfels give, with the guidance that :meth:`view` gave of it."""
+        """Return the members of one view from surfels and from its guidance by :meth:`view`."""
         (maps,) = self.light.relighter.surface_maps(camera, self.light.estimation)
         return stored_guidance(guidance) | maps
 
@@ -189,7 +189,7 @@ class LitSurfels:
         display: bool = False,
         **extra: object,
     ) -> ClipMeta:
-        """Metadata of one clip.
+        """Return the metadata of one clip.
 
         Args:
             family, light: of the light, and its number; 0 is the capture's own.
@@ -248,7 +248,7 @@ class CapturedSurfels:
         self._relighter = Relighter(found.scene, estimation, seed, cameras=cameras).prepare()
 
     def under(self, environment: EnvironmentMap, *light: int | str) -> LitSurfels:
-        """The surfels under a light, whose words name its random streams: none for the capture's own."""
+        """Light the surfels; words of the light name its random streams, none for the capture's own."""
         streams = (*self._streams, *light)
         lit = self._relighter.under(environment, integer(self._settings.seed, *streams, "light", "bounce"))
         contrast = classify(environment), contrast_share(environment)
@@ -257,7 +257,7 @@ class CapturedSurfels:
 
 @dataclass(frozen=True)
 class Photo:
-    """A photo as a frame shows it.
+    """A photo at the size of a frame.
 
     Attributes:
         camera: of the frame.
@@ -273,7 +273,7 @@ class Photo:
 
 
 def rows_of_photos(capture: Capture) -> list[list[View]]:
-    """Training views in rows without a gap, in the order of their names, numbers in them as numbers.
+    """Return training views in rows without gaps, in the natural order of their names.
 
     A photo that was skipped or held out ends a row.
     """
@@ -291,13 +291,13 @@ def rows_of_photos(capture: Capture) -> list[list[View]]:
 
 
 def in_order(name: str) -> tuple[tuple[int, int, str], ...]:
-    """Key that sorts names as people number them: img_9 before img_10."""
+    """Return a key for natural order of names: img_9 before img_10."""
     parts = [part for part in re.split(r"([0-9]+)", name) if part]
     return tuple((0, int(part), part) if part.isdecimal() else (1, 0, part) for part in parts)
 
 
 def frame_of(view: View, gain: np.ndarray, curve: ToneCurve, width: int, height: int) -> Photo:
-    """A photo in a frame's pixels.
+    """Resize and crop a photo to a frame.
 
     It is made smaller, by Pillow's Hamming filter in display space, until it just covers the frame, and what
     stands over at two edges is cut off.
@@ -326,7 +326,7 @@ def frame_of(view: View, gain: np.ndarray, curve: ToneCurve, width: int, height:
 def resized_view(
     camera: Camera, images: Sequence[np.ndarray], width: int, height: int
 ) -> tuple[Camera, list[np.ndarray]]:
-    """A camera and its images (H, W) or (H, W, C) in a frame's pixels, as :func:`frame_of` makes them.
+    """Resize and crop a camera and its images (H, W) or (H, W, C) to a frame, as :func:`frame_of` does.
 
     Raises:
         TronError: they are smaller than the frame.
@@ -352,13 +352,13 @@ def balanced(
 
 
 def require_size(views: Iterable[View], width: int, height: int) -> None:
-    """Raise TronError, naming the first photo, where one is smaller than a frame."""
+    """Raise TronError with the first photo that is smaller than a frame."""
     for view in views:
         _covered(view.camera, width, height, view.name)
 
 
 def _covered(camera: Camera, width: int, height: int, name: str = "") -> Box:
-    """Left, top, right and bottom of what a frame shows of a photo, pixels of the photo."""
+    """Return left, top, right and bottom of a frame's crop, pixels of the photo."""
     shrink = min(camera.width / width, camera.height / height)
     if shrink < 1:
         raise TronError(

@@ -1,4 +1,4 @@
-"""The captures in a folder, which split each is in, and where the path-traced truth of each lies.
+"""The captures in a folder, their splits, and the folders of their path-traced truth.
 
 ``captured.relit=FOLDER`` is the folder ``relit`` of pseudo-captures: a capture folder for each capture and
 light, ``NAME_1_sun``, with linear radiance, masks and the light itself as environment.exr. ``captured.truth``
@@ -33,7 +33,7 @@ OWN = Path("captures", "manifest.json")
 
 
 def find_captures(settings: Settings) -> dict[str, int]:
-    """Captures in a folder, the sub-folders that hold pictures: name -> about how many photos it has.
+    """Find captures, the sub-folders with pictures: name -> approximate number of photos.
 
     Raises:
         TronError: no such folder, one that is a capture itself, no captures in it, or one that is asked for
@@ -72,7 +72,7 @@ def find_captures(settings: Settings) -> dict[str, int]:
 
 
 def count_photos(folder: Path) -> int:
-    """About how many photos a capture has: its pictures in the folder that has most of them.
+    """Estimate the number of a capture's photos: the pictures in its folder with most of them.
 
     Copies of other sizes, masks and maps lie in folders of their own, and are no more than the photos.
     """
@@ -84,7 +84,7 @@ def count_photos(folder: Path) -> int:
 
 
 def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, list[str]]:
-    """Split -> names of its captures, sorted; those of a split with none are not there.
+    """Return split -> sorted names of its captures, without empty splits.
 
     Captures stand in an order drawn by (seed, name), and are cut where the shares say, to the nearest whole
     numbers (largest remainders). A split with a share has one at least where there are as many captures as
@@ -106,7 +106,7 @@ def split_of(names: Sequence[str], shares: Shares, seed: int) -> dict[Split, lis
 
 
 def split_by_name(names: Sequence[str]) -> dict[Split, list[str]]:
-    """Split -> names of its captures, sorted, by what stands before the hyphen in each.
+    """Return split -> sorted names of its captures, by the part before the hyphen in each name.
 
     Raises:
         TronError: a name that begins with no split's.
@@ -124,14 +124,14 @@ def split_by_name(names: Sequence[str]) -> dict[Split, list[str]]:
 
 
 def named_by_split(settings: Settings) -> bool:
-    """Whether all captures are named by splits, as pseudo-captures are, and the settings take no note."""
+    """Whether all captures are named by splits, as pseudo-captures are, and the settings ignore it."""
     heads = tuple(f"{split}-" for split in SPLITS)
     named = all(name.startswith(heads) for name in find_captures(settings))
     return named and not settings.captured.split_by_name
 
 
 def apportioned(shares: Mapping[Split, float], total: int) -> dict[Split, int]:
-    """Whole numbers that sum to ``total``, in proportion to shares: see :func:`split_of`."""
+    """Return integers that sum to ``total``, in proportion to shares: see :func:`split_of`."""
     wanted: list[Split] = sorted(
         (name for name in SPLITS if shares[name] > 0), key=lambda name: -shares[name]
     )
@@ -166,12 +166,12 @@ class RelitTruth:
 
     @property
     def environment(self) -> Path:
-        """The light, a lat-long map."""
+        """Path of the light, a lat-long map."""
         return self.folder / ENVIRONMENT_NAME
 
 
 def find_relit(settings: Settings, capture: str) -> list[RelitTruth]:
-    """A capture's views under other lights, in the order of the lights; none without ``captured.relit``.
+    """Find a capture's views under other lights, in the order of the lights; none without ``captured.relit``.
 
     Raises:
         TronError: no such folder, nothing of this capture in it, or a folder without its light or
@@ -198,7 +198,7 @@ def find_relit(settings: Settings, capture: str) -> list[RelitTruth]:
 
 
 def find_truth(settings: Settings, capture: str) -> list[View]:
-    """True views of a capture that have a map of their base color; none without ``captured.truth``.
+    """Find true views of a capture with base color maps; none without ``captured.truth``.
 
     Raises:
         TronError: no such folder, nothing of this capture in it, or no such map.
@@ -216,7 +216,7 @@ def find_truth(settings: Settings, capture: str) -> list[View]:
 
 
 def _views(folder: Path) -> int:
-    """Number of views in a folder; TronError where it cannot be used."""
+    """Return the number of views in a folder; TronError if it cannot be used."""
     if not (folder / ENVIRONMENT_NAME).is_file():
         raise TronError(
             "the light of the relit views is missing", folder / ENVIRONMENT_NAME, "make them again"

@@ -1,4 +1,4 @@
-"""Surfels and light of a capture, found once and kept beside the shards.
+"""Find surfels and light of a capture once, and keep them beside the shards.
 
 Poses of bare photos and the checkpoint of the reconstruction are kept in ``scenes/NAME/work`` until the scene
 is finished. Surfels and light are written when they are found, and are read back by whoever goes on from
@@ -59,7 +59,7 @@ PHASES = {
 
 @dataclass(frozen=True)
 class Found:
-    """Reconstruction of a capture, as it is kept.
+    """Stored reconstruction of a capture.
 
     Attributes:
         scene: surfels with materials.
@@ -75,17 +75,17 @@ class Found:
 
 
 def require_prior(settings: Settings) -> None:
-    """Raise TronError where the prior cannot be made, before any capture is read."""
+    """Raise TronError if the prior cannot be made, before any capture is read."""
     make_object(settings.captured.prior, "captured.prior")
 
 
 def tell(item: Work, phase: str) -> None:
-    """Say in the log which of :data:`PHASES` begins."""
+    """Log the start of one of :data:`PHASES`."""
     log.info("%s (%s): %s", item.name, item.capture, PHASES[phase])
 
 
 def load(item: Work, settings: Settings, folder: Path, reduced: bool) -> Capture:
-    """The capture, its photos as large as the reconstruction wants them or as they are.
+    """Load the capture with photos at the size of the reconstruction, or at full size.
 
     What is wrong with photos is told of the reduced ones alone: of the others it is the same.
     """
@@ -105,7 +105,7 @@ def load(item: Work, settings: Settings, folder: Path, reduced: bool) -> Capture
 
 @contextmanager
 def _quiet_reading() -> Iterator[None]:
-    """Say nothing of what reading a capture finds."""
+    """Silence log lines of reading a capture."""
     teller = logging.getLogger(tron.captures.__name__)
     before = teller.level
     teller.setLevel(logging.ERROR)
@@ -116,7 +116,7 @@ def _quiet_reading() -> Iterator[None]:
 
 
 def kept(folder: Path, capture: Capture) -> Found | None:
-    """Findings of a run on the same photos; None where there are none, and it has to be done (again)."""
+    """Load the stored result for the same photos; None if it has to be made (again)."""
     try:
         facts = json.loads((folder / SPEC_NAME).read_text("utf-8"))
         if facts["content"] != capture.content:
@@ -181,7 +181,7 @@ def find(item: Work, settings: Settings, capture: Capture, folder: Path) -> None
 
 
 def _drop_other(checkpoint: Path, capture: Capture, prior: Prior, how: ReconstructionSettings) -> None:
-    """Remove a checkpoint of other photos, or one that is damaged: it would stop every later run."""
+    """Remove a damaged checkpoint, or one of other photos: it would stop every later run."""
     try:
         require_same_run(checkpoint, capture, prior, how)
     except TronError as error:
@@ -190,7 +190,7 @@ def _drop_other(checkpoint: Path, capture: Capture, prior: Prior, how: Reconstru
 
 
 def _gains(found: Reconstruction, capture: Capture) -> np.ndarray:
-    """(V, 3) exposure and white balance of the training photos; read off the surfels where no prior says."""
+    """Return exposure and white balance of the training photos (V, 3), from the prior or the surfels."""
     if found.gains is not None:
         return found.gains
     tracer = SurfelTracer(found.scene)
@@ -198,7 +198,7 @@ def _gains(found: Reconstruction, capture: Capture) -> np.ndarray:
 
 
 def _scores(found: Reconstruction, capture: Capture) -> Mapping[str, Any]:
-    """Mean figures of the held-out photos, or of some of the others where none is held out."""
+    """Return mean figures of the held-out photos, or of some others if none is held out."""
     figures = mean_figures(found.scores["test" if capture.test else "train"])
     return {"of": "held-out" if capture.test else "training"} | {
         name: round(value, 4) for name, value in figures.items()
@@ -213,7 +213,7 @@ FOUND = (SURFELS_NAME, ENVIRONMENT_NAME)
 
 
 def require_reusable(settings: Settings) -> None:
-    """Make sure that ``captured.reconstructed`` is a dataset of captures, reconstructed as this one would be.
+    """Require that ``captured.reconstructed`` is a dataset of captures with the same reconstruction settings.
 
     Raises:
         TronError: it is not; names the first key that differs.

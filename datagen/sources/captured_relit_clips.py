@@ -1,4 +1,4 @@
-"""Clips of a capture under lights that its photos never saw: guidance of its surfels, path-traced truth."""
+"""Clips of a capture under lights that its photos never saw: guidance by surfels, truth by path tracing."""
 
 from __future__ import annotations
 
@@ -69,7 +69,7 @@ def relit_clips(item: Work, settings: Settings, found: Found) -> Iterator[tuple[
 
 
 def require_own_truth(item: Work, settings: Settings, photos: Capture) -> None:
-    """Make sure that what ``captured.relit`` and ``truth`` show is of this very capture, and can be used.
+    """Require that ``captured.relit`` and ``truth`` are of this capture, and usable.
 
     Relit views are named after the photos whose places they are seen from, and a pseudo-capture's poses are
     off by little.
@@ -123,7 +123,7 @@ def _require_truth(views: Sequence[View], truth: RelitTruth) -> None:
 def _frame(
     view: View, lit: LitSurfels, environment: EnvironmentMap, settings: Settings
 ) -> tuple[Camera, Frame]:
-    """One view at the frame's size: its camera and members."""
+    """Return camera and members of one view at the frame's size."""
     wanted = settings.captured
     mask = view.read("mask")[..., None]
     behind = environment.lookup(view.camera.rays())

@@ -1,4 +1,4 @@
-"""Surfels of a synthetic scene, found from pictures as a capture's are.
+"""Surfels of a synthetic scene, reconstructed from pictures as for a capture.
 
 The scene's views are path-traced under one of its lights, turned to display values and
 reconstructed, flaws included; all of it lies in a folder of the scene until the scene is finished, so that a
@@ -54,7 +54,7 @@ SCALED_BY = 8
 def reconstruct_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, ReconstructedFigures]:
-    """Surfels reconstructed from pictures of a scene, and how near they are to the truth.
+    """Reconstruct surfels from pictures of a scene, and measure their errors.
 
     Where light and materials are fitted together, base color is brought to the truth's scale. They are judged
     by the cameras of the first clip, which are not among the pictures'.
@@ -84,12 +84,12 @@ def reconstruct_surfels(
 
 
 def light_of_pictures(spec: SceneSpec) -> int:
-    """Number of the scene's light that its pictures are taken under."""
+    """Return the number of the light of the scene's pictures."""
     return integer(spec.seed, spec.split, spec.index, "reconstruction", "light") % len(spec.lights)
 
 
 def _pictures(spec: SceneSpec, geometry: Geometry, settings: Settings, folder: Path) -> Capture:
-    """The scene's views as a capture on disk, path-traced unless they are there."""
+    """Return the scene's views as a capture on disk, path-traced unless they exist."""
     where = folder / "pictures"
     if not where.is_dir():
         shutil.rmtree(folder, ignore_errors=True)  # half a capture
@@ -111,7 +111,7 @@ def _pictures(spec: SceneSpec, geometry: Geometry, settings: Settings, folder: P
 def _base_colors(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> Iterator[tuple[Camera, np.ndarray, np.ndarray]]:
-    """Camera, true base color and mask of some of the views."""
+    """Yield camera, true base color and mask of some views."""
     made = settings.surfel_budget(spec.split, spec.index)
     cameras = spec.views(max(made.views, 2), made.view_width, made.view_height)
     for seen in stream_gbuffers(geometry, cameras[:: -(-len(cameras) // SCALED_BY)]):
@@ -121,7 +121,7 @@ def _base_colors(
 def _with_objects(
     surfels: GaussianScene, spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> GaussianScene:
-    """The surfels with the ids of the objects that they lie on, which no picture tells."""
+    """Return the surfels with the true ids of their objects, which pictures do not show."""
     made = settings.surfel_budget(spec.split, spec.index)
     cameras = spec.views(made.views, made.view_width, made.view_height)
     truth = surfels_from_gbuffers(stream_gbuffers(geometry, cameras), count=made.surfels)
@@ -153,7 +153,7 @@ def _judged(
 def at_true_scale(
     surfels: GaussianScene, truth: Iterable[tuple[Camera, np.ndarray, np.ndarray]]
 ) -> tuple[GaussianScene, np.ndarray]:
-    """The surfels with their base color scaled to the truth, and the factors (3,).
+    """Scale the surfels' base color to the truth; return surfels and factors (3,).
 
     A joint fit of light and materials leaves one factor a channel open: twice the reflectance under half the
     light is the same photo. Under another light it is not. Data that relighting is learnt from or judged by

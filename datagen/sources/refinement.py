@@ -1,4 +1,4 @@
-"""Surfels of a synthetic scene fitted to its true G-buffers, and how near to them they come.
+"""Fit surfels of a synthetic scene to its true G-buffers, and measure their errors.
 
 Surfels made straight from G-buffers blur what is smaller than they are and overhang silhouettes by a pixel.
 """
@@ -50,7 +50,7 @@ def refine_surfels(
     steps: int,
     seed: int,
 ) -> tuple[GaussianScene, Refinement]:
-    """Fit surfels to what ``seen`` shows of them, and judge them by ``held_out``; one view is read at a time.
+    """Fit surfels to the views ``seen``, and judge them by ``held_out``; one view is read at a time.
 
     Args:
         surfels: as made from ``seen``. steps: of the optimisation. seed: of the order of views.
@@ -71,7 +71,7 @@ def refine_surfels(
 
 
 def figures_of(tracer: SurfelTracer, views: Sequence[View]) -> Figures:
-    """Surfels against the true G-buffers of views, one read at a time."""
+    """Measure surfels against true G-buffers of views, read one at a time."""
     means = mean_figures(score_views(tracer, views))
     errors = [
         np.abs(tracer.gbuffer(view.camera).numpy()["opacity"] - view.read("mask")).mean() for view in views
@@ -84,7 +84,7 @@ def figures_of(tracer: SurfelTracer, views: Sequence[View]) -> Figures:
 
 
 def _fitted(scene: GaussianScene, views: Sequence[View], steps: int, seed: int) -> GaussianScene:
-    """The scene after some steps of the reconstruction's own optimiser, on all that the views know at once.
+    """Optimise the scene by the reconstruction's optimiser, on all maps of the views at once.
 
     Surfels made straight from G-buffers blur what is smaller than they are and overhang silhouettes by a
     pixel. Every parameter answers to the views, which have normal, base_color, roughness, metallic and mask.

@@ -1,4 +1,4 @@
-"""What every source of clips can do: plan scenes, make one, and say what it costs and comes from."""
+"""Interface of all sources of clips: plan scenes, make one, estimate its cost."""
 
 from __future__ import annotations
 
@@ -35,20 +35,20 @@ class SceneCost:
 
 
 class Source(Protocol):
-    """Where the clips of a dataset come from; all methods but :meth:`make` are quick and write nothing."""
+    """Source of a dataset's clips; all methods except :meth:`make` are quick and write nothing."""
 
     def plan(self, settings: Settings) -> list[Work]:
-        """Every scene of the dataset, in order of split and index; TronError where there are none."""
+        """Return every scene of the dataset, in order of split and index; TronError if there are none."""
         ...
 
     def planned(self, settings: Settings) -> dict[str, Any]:
-        """Split -> what config.yaml keeps of its scenes: their number, or their names."""
+        """Return split -> entry in config.yaml: number or names of its scenes."""
         ...
 
     def require_same(
         self, run: RunFolder, before: dict[str, Any], scenes: Mapping[str, Any], settings: Settings
     ) -> None:
-        """Make sure that a folder's dataset is this one, or one that may grow to be.
+        """Require that a folder's dataset is this one, or can grow into it.
 
         Args:
             run: the folder.
@@ -61,7 +61,7 @@ class Source(Protocol):
         """
 
     def ready(self, settings: Settings) -> None:
-        """Raise TronError where what scenes are made with cannot be had, before the first of them."""
+        """Raise TronError before the first scene if an input of scenes is missing."""
 
     def make(self, item: Work, settings: Settings, sources: Sources) -> Record:
         """Make one scene: its files, its shards and at last its record. Runs in a worker.
@@ -74,27 +74,27 @@ class Source(Protocol):
         ...
 
     def clips(self, item: Work, settings: Settings) -> int:
-        """Clips that a scene gives, about."""
+        """Return the approximate number of clips of a scene."""
         ...
 
     def frames(self, item: Work, settings: Settings) -> int:
-        """Frames of all its clips, about."""
+        """Return the approximate number of frames of all its clips."""
         ...
 
     def surfels(self, item: Work, settings: Settings) -> int:
-        """Surfels of a scene, at the most."""
+        """Return the maximum number of surfels of a scene."""
         ...
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
-        """Cost of a scene that is not made yet."""
+        """Return the cost of an unmade scene."""
         ...
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
-        """Bytes on disk that a scene takes at the most while it is made, and then no more."""
+        """Return the maximum bytes of temporary files while a scene is made."""
         ...
 
     def kept_bytes(self, settings: Settings, items: Iterable[Work], shards: bool = True) -> int:
-        """Bytes that finished scenes keep, as if nothing compressed: shards if asked for, previews, surfels.
+        """Return uncompressed bytes of finished scenes: optionally shards, previews, surfels.
 
         Half-precision EXR hardly compresses noise.
         """
@@ -112,6 +112,6 @@ class Source(Protocol):
 
 
 def spooled_bytes(settings: Settings, split: str) -> int:
-    """Bytes of a pixel of a frame that waits on disk for its shard."""
+    """Return bytes per pixel of a spooled frame."""
     members = (MEMBERS[name] for name in clip_members(settings.split(split).reference_buffers))
     return sum(max(member.bytes, 2) * member.channels for member in members)

@@ -1,4 +1,4 @@
-"""Surfels of a synthetic scene and, light by light, its clips of training pairs."""
+"""Make surfels of a synthetic scene and, light by light, its clips of training pairs."""
 
 from __future__ import annotations
 
@@ -84,10 +84,10 @@ VIEW_BYTES = 49  # a pixel of a true G-buffer; LANES / 2 pixels are rendered at 
 
 
 class SyntheticSource(Source):
-    """Scenes that are drawn from seeds and path-traced, one clip a light."""
+    """Source of scenes drawn from seeds and path-traced, one clip per light."""
 
     def plan(self, settings: Settings) -> list[Work]:
-        """As many scenes a split as it asks for; each has numbers of shards of its own."""
+        """Return the scenes of each split; each scene has its own shard numbers."""
         items = []
         for split in settings.used_splits():
             recipe = settings.split(split)
@@ -98,13 +98,13 @@ class SyntheticSource(Source):
         return items
 
     def planned(self, settings: Settings) -> dict[str, Any]:
-        """Split -> number of its scenes."""
+        """Return split -> number of its scenes."""
         return {split: settings.split(split).scenes for split in SPLITS}
 
     def require_same(
         self, run: RunFolder, before: dict[str, Any], scenes: Mapping[str, Any], settings: Settings
     ) -> None:
-        """Let more scenes be added, and splits begin; nothing else may change."""
+        """Allow more scenes and new splits; refuse any other change."""
         before, now = dict(before), settings.recipe()
         for split in SPLITS:
             if not scenes.get(split):  # there is nothing of it yet, so it may be anything from now on
@@ -126,19 +126,19 @@ class SyntheticSource(Source):
         return make_scene(item, settings, sources)
 
     def clips(self, item: Work, settings: Settings) -> int:
-        """One a light."""
+        """Return the number of clips, one per light."""
         return len(settings.split(item.split).lights)
 
     def frames(self, item: Work, settings: Settings) -> int:
-        """Frames of those."""
+        """Return the number of frames of these clips."""
         return self.clips(item, settings) * settings.split(item.split).frames
 
     def surfels(self, item: Work, settings: Settings) -> int:
-        """As many as are asked for, or as suit the frames."""
+        """Return the number in the settings, or the number that suits the frames."""
         return settings.surfel_budget(item.split, item.index).surfels
 
     def cost(self, item: Work, settings: Settings) -> SceneCost:
-        """By the table above."""
+        """Return the cost by the table above."""
         recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         pixels, frames = recipe.width * recipe.height, self.frames(item, settings)
         views = made.views * made.view_pixels
@@ -163,7 +163,7 @@ class SyntheticSource(Source):
         return SceneCost(seconds, COMPRESSED * whole, PROCESS + max(gathered, LANE * lanes + held))
 
     def scratch_bytes(self, item: Work, settings: Settings) -> int:
-        """Views that surfels are fitted to, or pictures and a checkpoint; then frames of clips."""
+        """Return the bytes of views for the fit, or of pictures and a checkpoint; then of frames of clips."""
         recipe, made = settings.split(item.split), settings.surfel_budget(item.split, item.index)
         views = made.views + (-(-made.views // 2) if recipe.moving_objects else 0)
         clip = recipe.frames * recipe.width * recipe.height * spooled_bytes(settings, item.split)
@@ -179,7 +179,7 @@ class SyntheticSource(Source):
 
 
 def _rays(settings: Settings, item: Work) -> float:
-    """Shadow rays a pixel of guidance, margins of windows included, mean of a scene's clips."""
+    """Return shadow rays per pixel of guidance, including margins of windows, mean over a scene's clips."""
     recipe = settings.split(item.split)
     of_clips = [
         settings.estimation(item.split, item.index, light).rays for light in range(len(recipe.lights))
@@ -193,7 +193,7 @@ def _rays(settings: Settings, item: Work) -> float:
 def make_surfels(
     spec: SceneSpec, geometry: Geometry, settings: Settings
 ) -> tuple[GaussianScene, Refinement | None]:
-    """Surfels through what its capture's views see of a scene, then fitted to it, and what that gained.
+    """Make surfels from the visible surfaces of a scene's views, fit them, and return the gain too.
 
     They are judged by the cameras of the first clip, which are not among those.
     """
@@ -216,7 +216,7 @@ def make_surfels(
 
 
 def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Iterator[GBufferView]:
-    """True G-buffers of the views that surfels are made from, a few in memory at a time.
+    """Yield true G-buffers of the views for surfels, a few in memory at a time.
 
     Where an object moves, every other view comes once more with the object away and left out: what it rests
     on has no hole.
@@ -230,7 +230,7 @@ def _seen(spec: SceneSpec, geometry: Geometry, cameras: Sequence[Camera]) -> Ite
 
 
 def _move(spec: SceneSpec, geometry: Geometry, time: float) -> int:
-    """Put the object that moves where it is at a time; its id."""
+    """Move the moving object to its place at a time; return its id."""
     number = _moving_id(spec)
     geometry.move(number, _pose(spec, time))
     return number
@@ -249,7 +249,7 @@ def _pose(spec: SceneSpec, time: float) -> Pose:
 def make_clips(
     spec: SceneSpec, geometry: Geometry, surfels: GaussianScene, settings: Settings
 ) -> Iterator[tuple[ClipMeta, Sequence[Frame]]]:
-    """Render one clip a light, in the order of the specification.
+    """Render one clip per light, in the order of the specification.
 
     Each frame holds the schema's members, linear: guidance from the surfels, rgb path-traced from the meshes,
     both under the same baked map; with reference buffers also what Mitsuba says of the pixel centres. Lights
@@ -294,7 +294,7 @@ class _Lit:
 
 @dataclass
 class _Moment:
-    """A scene at one time of its clips: where things are and how they are lit.
+    """A scene at one time of its clips: places and light.
 
     Attributes:
         scenes: under no light, for frames that all lights share; or one a light.
@@ -315,7 +315,7 @@ def _moment(
     settings: Settings,
     time: float,
 ) -> _Moment:
-    """The scene at a time from 0 to 1 under the lights of these numbers; moves the geometry."""
+    """Return the scene at a time from 0 to 1 under lights of these numbers; it moves the geometry."""
     recipe, scene = settings.split(spec.split), relighter.scene
     if spec.motion is not None:
         which = scene.object_id == _move(spec, geometry, time)
@@ -395,7 +395,7 @@ def _film(
 
 
 def _path_traced(now: _Moment, camera: Camera, spp: int, seed: int, bounces: int) -> np.ndarray:
-    """(lights, H, W, 3) linear radiance under each light of a moment."""
+    """Path-trace linear radiance under each light of a moment, (lights, H, W, 3)."""
     if now.stacked is None:
         return render_frames(now.scenes[0], [camera], spp, [seed], bounces)
     return render_lights(now.scenes[0], now.stacked, camera, spp, seed)
@@ -410,7 +410,7 @@ def _meter(
     seed: int,
     bounces: int,
 ) -> None:
-    """Expose each light's clip for the whole of its first picture, not for the part that a window shows."""
+    """Expose each light's clip for its whole first picture, not for a window of it."""
     valid, picture = truth.valid, window.picture
     if (picture.width, picture.height) != (window.width, window.height):
         small = picture.resized(METER_WIDTH, max(1, round(METER_WIDTH * picture.height / picture.width)))
@@ -501,7 +501,7 @@ def _reference(
     direct: DirectIrradiance,
     environment: EnvironmentMap,
 ) -> Frame:
-    """Reference members of one frame; behind the scene irradiance shows the environment, as guidance does."""
+    """Return reference members of a frame; behind the scene irradiance is the environment, as in guidance."""
     seen = truth.valid[..., None]
     behind = environment.lookup(camera.rays())
     light = {"irradiance": direct.shadowed, "unshadowed": direct.unshadowed}
@@ -551,7 +551,7 @@ def make_scene(item: Work, settings: Settings, sources: Sources) -> Record:
 
 
 def _variety(geometry: Geometry, made: Sequence[tuple[ClipMeta, Frame]]) -> Histograms:
-    """Histograms of the clips' first frames: those beside them show the same."""
+    """Count histograms of the clips' first frames, which stand for the others."""
     cameras = [Camera.from_dict(meta.cameras[0]) for meta, _ in made]
     return total(
         frame_histograms(frame | surface_members(truth), camera, meta.extra.get("contrast_share"))

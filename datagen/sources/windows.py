@@ -1,4 +1,4 @@
-"""Frames that are windows of larger pictures: many scales for the price of small frames.
+"""Windows of larger pictures as frames: many scales at the cost of small frames.
 
 A window is a camera with another principal point. Where it lies follows from a seed and from what the picture
 shows. Filters of guidance look beyond a window's edge as they do in the picture:
@@ -49,7 +49,7 @@ class Window:
         return self.picture.window(self.x, self.y, self.width, self.height)
 
     def with_margin(self) -> Window:
-        """The part and what lies within :data:`MARGIN` of it, as far as the picture goes."""
+        """Return the window with :data:`MARGIN` around it, inside the picture."""
         left, top = max(self.x - MARGIN, 0), max(self.y - MARGIN, 0)
         right = min(self.x + self.width + MARGIN, self.picture.width)
         bottom = min(self.y + self.height + MARGIN, self.picture.height)
@@ -64,7 +64,7 @@ class Window:
 
 
 def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, light: int) -> list[Window]:
-    """The windows of a clip, one a frame; whole pictures where the recipe asks for no windows.
+    """Draw the windows of a clip, one per frame; whole pictures if the recipe has no windows.
 
     Frames that are neighbours of one clip (``window_each=clip``) follow one point of the scene in pictures of
     one size, as far as the picture goes; else each frame draws its own.
@@ -97,7 +97,7 @@ def draw_windows(spec: SceneSpec, geometry: Geometry, recipe: SplitSettings, lig
 def _point(
     picture: Camera, geometry: Geometry, surroundings: int, draw: np.random.Generator
 ) -> np.ndarray | None:
-    """Some point (3,), world, of what the picture shows; None where it shows no surface.
+    """Return a random visible surface point (3,), world; None if no surface is visible.
 
     Half of them lie on an object where one is seen: floors and skies teach little.
     """

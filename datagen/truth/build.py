@@ -1,4 +1,4 @@
-"""SceneSpec -> Mitsuba scene.
+"""Build a Mitsuba scene from a SceneSpec.
 
 All procedural objects and what surrounds them are one mesh under one material whose parameters and normals
 come from one atlas. Every synthetic scene then has the same kernel, whatever it holds: Dr.Jit compiles it
@@ -56,7 +56,7 @@ FEWEST, MOST = 2**20, 2**23
 
 
 class _Solid(NamedTuple):
-    """A piece in its object's frame, where it stands, and its object's id."""
+    """A piece in its object's frame, with placement and id of the object."""
 
     surface: texels.Surface
     matrix: np.ndarray
@@ -65,7 +65,7 @@ class _Solid(NamedTuple):
 
 @dataclass
 class Surface(Shape):
-    """A mesh of the scene, and which object each of its triangles is of.
+    """A mesh of the scene, and the object of each triangle.
 
     Attributes:
         object_id: (F,) uint32 object of each triangle.
@@ -83,7 +83,7 @@ class Geometry:
     surfaces: list[Surface]
 
     def move(self, object_id: int, pose: Pose) -> None:
-        """Put an object where it is at a time, away from where it rests; scenes made before do not follow."""
+        """Move an object from its rest place to its place at a time; existing scenes do not change."""
         for surface in self.surfaces:
             if not (surface.object_id == object_id).any():
                 continue
@@ -101,7 +101,7 @@ class Geometry:
             parameters.update()
 
     def lit(self, environment: EnvironmentMap | None = None) -> mi.Scene:
-        """The Mitsuba scene under a light; without one it still answers rays."""
+        """Return the Mitsuba scene under a light; without a light it still traces rays."""
         scene: dict[str, Any] = {"type": "scene"}
         scene |= {f"surface{i}": surface.shape for i, surface in enumerate(self.surfaces)}
         if environment is not None:
@@ -160,7 +160,7 @@ def build(
 
 
 def _solids(solids: Sequence[_Solid], texels_per_unit: float, most: int = texels.MOST_TEXELS) -> Surface:
-    """All procedural pieces as one mesh under one material, whose textures are one atlas."""
+    """Return all procedural pieces as one mesh with one material and one texture atlas."""
     atlas = texels.bake([solid.surface for solid in solids], texels_per_unit, most)
     vertices, normals, uvs, faces, ids, count = [], [], [], [], [], 0
     for (surface, matrix, object_id), (index, uv, corners) in zip(solids, atlas.laid):
@@ -191,7 +191,7 @@ def _of_model(part: Part, object_id: int, index: int) -> Surface:
 def draw_and_build(
     item: Work, settings: Settings, sources: Sources, lights: Sequence[LightChoice]
 ) -> tuple[SceneSpec, Geometry]:
-    """A scene's specification, with a light of each of the given families, and its meshes."""
+    """Return a scene's specification, with a light of each given family, and its meshes."""
     recipe = settings.split(item.split)
     checked, sources = slots(settings, sources), of_split(settings, sources, item.split)
     models = load_models(settings.assets, sources.assets) if settings.assets is not None else {}
@@ -223,7 +223,7 @@ def draw_and_build(
 
 
 def scene_geometry(spec: SceneSpec, settings: Settings, sources: Sources) -> Geometry:
-    """Build a scene; models are read once a process, texture sets at the size that the scene needs.
+    """Build a scene; models are read once per process, texture sets at the size for the scene.
 
     Raises:
         TronError: the scene names an asset or a texture set that is not among the sources.
@@ -254,7 +254,7 @@ def most_texels(spec: SceneSpec, settings: Settings) -> int:
 
 
 def _cameras(spec: SceneSpec, settings: Settings) -> list[list[Camera]]:
-    """Some cameras of each path that pictures are taken from."""
+    """Return some cameras of each camera path."""
     captures = {"captures": settings.capture, "pseudo_captures": settings.pseudo_capture}
     if settings.mode in captures:
         capture = captures[settings.mode]

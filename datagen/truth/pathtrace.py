@@ -34,7 +34,7 @@ LANES = 2**22
 
 
 def path_segments(bounces: int) -> int:
-    """Mitsuba's ``max_depth`` of light that bounces so often: a path has one segment more at each end."""
+    """Return Mitsuba's ``max_depth`` for a number of bounces: a path has one more segment at each end."""
     return bounces + 2
 
 
@@ -47,7 +47,7 @@ def render_frames(
     bounces: int = BOUNCES,
     transparent: bool = False,
 ) -> np.ndarray:
-    """Path-trace one frame a camera.
+    """Path-trace one frame per camera.
 
     Args:
         scene: a lit scene; its light is seen directly behind it.
@@ -107,7 +107,7 @@ def render_lights(scene: mi.Scene, lights: mi.Integrator, camera: Camera, spp: i
 def _render(
     scene: mi.Scene, integrator: mi.Integrator, camera: Camera, spp: int, seed: int, transparent: bool
 ) -> np.ndarray:
-    """(H, W, C) float32: all channels of a frame."""
+    """Render all channels of a frame: (H, W, C) float32."""
     passes = -(-spp // max(LANES // (camera.width * camera.height), 1))
     part = near_product(-(-spp // passes))
     description = mitsuba_sensor(camera, part, pixel_format="rgba" if transparent else "rgb")
@@ -125,7 +125,7 @@ def _render(
 
 
 def near_product(count: int) -> int:
-    """Least product of two near numbers, such as 7 x 8, that is ``count`` or more.
+    """Return the least product of two near numbers, such as 7 x 8, that is ``count`` or more.
 
     Mitsuba's ``multijitter`` rounds a number of samples up to it, with a warning.
     """
@@ -138,7 +138,7 @@ def _pass_seed(seed: int, done: int) -> int:
 
 
 def gbuffers(geometry: Geometry, cameras: Sequence[Camera]) -> list[GBufferView]:
-    """All views of :func:`stream_gbuffers` at once."""
+    """Return all views of :func:`stream_gbuffers` at once."""
     return list(stream_gbuffers(geometry, cameras))
 
 
@@ -193,7 +193,7 @@ def _views(geometry: Geometry, scene: mi.Scene, cameras: Sequence[Camera]) -> li
 
 
 class DirectIrradiance(NamedTuple):
-    """E / pi, linear, (H, W, 3) float32, of the surfaces at the pixel centres; 0 where there is none."""
+    """E / pi, linear, (H, W, 3) float32, on surfaces at the pixel centres; 0 off surfaces."""
 
     shadowed: np.ndarray
     unshadowed: np.ndarray
@@ -301,7 +301,7 @@ MOST_STOPS = 6
 
 
 def metered(frame: np.ndarray, foreground: np.ndarray, exposure: float) -> float:
-    """Exposure at which a frame's median is GREY, no lower than the light's own.
+    """Return the exposure at which a frame's median is GREY, at least the light's own.
 
     Rooms are darker than what lights them: exposed for the sky, all of them would be black. Pixels that are
     not finite do not count: their clip is set aside by name, and needs an exposure until then.

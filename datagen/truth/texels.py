@@ -107,7 +107,7 @@ def bake(surfaces: Sequence[Surface], texels_per_unit: float, most: int = MOST_T
 
 
 def pack(sizes: np.ndarray) -> tuple[np.ndarray, tuple[int, int]]:
-    """Places (C, 2) of rectangles (C, 2) int, width and height, on shelves; the atlas' height and width."""
+    """Pack rectangles (C, 2) int, width and height, on shelves; return places (C, 2), height and width."""
     width = max(int(np.sqrt(1.1 * sizes.prod(axis=1).sum())) + 1, int(sizes[:, 0].max()))
     places = np.zeros_like(sizes)
     x = y = shelf = 0
@@ -150,7 +150,7 @@ def _texels(charts: Charts, density: float) -> np.ndarray:
 
 
 def _unfolded(charts: Charts, surface: Surface, density: float) -> tuple[Charts, _Texels]:
-    """Charts none of which covers a texel twice, and their texels."""
+    """Return charts that cover no texel twice, and their texels."""
     for attempt in range(ROUNDS):
         texels, folded = _rasterise(charts, density)
         if not len(folded):
@@ -217,7 +217,7 @@ def _depths(charts: Charts, density: float, pairs: _Pairs) -> tuple[np.ndarray, 
 
 
 def _rasterise(charts: Charts, density: float) -> tuple[_Texels, np.ndarray]:
-    """Each texel that a lookup touches with the triangle that it lies in or is nearest to; folded charts."""
+    """Assign each texel within reach of a lookup to its triangle or the nearest one; find folded charts."""
     size = _texels(charts, density)
     pairs = _pairs(charts, density)
     depth, weights = _depths(charts, density, pairs)

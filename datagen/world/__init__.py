@@ -1,1 +1,1 @@
-"""What a scene is made of, and how one is drawn from its seed."""
+"""Objects, materials, lights and cameras of scenes, drawn from seeds."""

@@ -1,6 +1,7 @@
 """The picture of docs/concepts/light.md: the wall of a zoo that was measured, smaller.
 
-tron-eval benchmark=zoo output_dir=outputs/zoo && python dev/pictures/zoo.py outputs/zoo docs/images/zoo.jpg
+tron-eval benchmark=zoo benchmark.real_data=FOLDER output_dir=outputs/zoo
+python dev/pictures/zoo.py outputs/zoo docs/images/zoo.jpg
 """
 
 import sys

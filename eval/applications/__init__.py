@@ -1,1 +1,1 @@
-"""What can be done with a scene: select, insert, move, bake, look; each held against an outside witness."""
+"""Applications of a scene (select, insert, move, bake, view), each compared with an independent reference."""

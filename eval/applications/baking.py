@@ -1,9 +1,9 @@
-"""What `tron-bake` writes, against frames of the same light at views that no fit saw.
+"""Files of `tron-bake` against frames under the same light, at views that no fit saw.
 
 A scene is drawn three ways from its harmonics: by TRON with its own kernel, by TRON with the kernel of 3DGS
 (degree 2) that files for other viewers have, and by a rasteriser of 3DGS in NumPy that shares no code with
-TRON's (:mod:`eval.applications.splat_rasteriser`). All are held against ``lit`` of the same surfels, so what
-is judged is the baking and not the surfels. Pixels count that surfels fill.
+TRON's (:mod:`eval.applications.splat_rasteriser`). All are held against ``lit`` of the same surfels, so the
+baking is judged and not the surfels. Only pixels that surfels fill count.
 """
 
 from __future__ import annotations
@@ -55,9 +55,9 @@ class Baked:
     """One scene under one light, baked.
 
     Attributes:
-        scene: its name. kind: of :data:`KINDS`.
+        scene: name of the scene. kind: of :data:`KINDS`.
         psnr: way of :data:`DRAWN` -> dB of each view.
-        images: of the first view, the truth first.
+        images: pictures of the first view, the truth first.
     """
 
     scene: str
@@ -67,7 +67,7 @@ class Baked:
 
 
 def measure_baking(folders: Sequence[Path], seed: int, outcome: Outcome) -> None:
-    """Bake the first scenes, each under a sun or a soft light, and judge what is drawn of them."""
+    """Bake the first scenes, each under a sun or a soft light, and score renderings of the baked files."""
     found = []
     for number, folder in enumerate(folders[:SCENES]):
         own = GaussianScene.load(folder / "surfels.ply")
@@ -79,7 +79,7 @@ def measure_baking(folders: Sequence[Path], seed: int, outcome: Outcome) -> None
 
 
 def baking_rows(found: Sequence[Baked], seed: int) -> Iterator[Row]:
-    """Means over scenes of a kind, what other kernels lose, and every scene's own figures."""
+    """Yield means over scenes of a kind, losses by other kernels, and the figures of every scene."""
     for kind in KINDS:
         of_kind = [each for each in found if each.kind == kind]
         for name in DRAWN:
@@ -130,13 +130,13 @@ def _judged(name: str, kind: str, own: GaussianScene, light: str, number: int, s
 
 
 def _harmonics(scene: GaussianScene, camera: Camera) -> np.ndarray:
-    """(H, W, 3) display values of a scene's harmonics over black."""
+    """Render a scene's harmonics over black: (H, W, 3) display values."""
     view = SurfelTracer(scene).gbuffer(camera)
     return view.images({"rgb": view.rgb})["rgb"]
 
 
 def _coarse(image: np.ndarray) -> np.ndarray:
-    """Means over FINENESS x FINENESS pixels."""
+    """Average over blocks of FINENESS x FINENESS pixels."""
     return image.reshape(SIDE, FINENESS, SIDE, FINENESS, 3).mean((1, 3))
 
 

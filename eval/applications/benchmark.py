@@ -1,4 +1,4 @@
-"""Benchmark `applications`: what is done with a scene, part by part, each against an outside witness."""
+"""Benchmark `applications`: each application of a scene against an independent reference."""
 
 from __future__ import annotations
 
@@ -22,22 +22,22 @@ SCENES = "scenes"
 
 
 class Applications(Benchmark):
-    """Parts of the benchmark; scenes that are made are not made again."""
+    """Settings: parts of the benchmark; finished scenes are reused."""
 
     name: ClassVar[str] = "applications"
 
-    parts: list[Part] = Field(description="what is measured", min_length=1)
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
     seed: int = 0
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
-    threads: PositiveInt | None = Field(default=None, description="threads of Dr.Jit; null: one a core")
+    threads: PositiveInt | None = Field(default=None, description="threads of Dr.Jit; null: one per core")
     scenes: list[str] = Field(
-        description="arguments of tron-datagen: scenes with true object ids, to select in and to bake"
+        description="arguments of tron-datagen: scenes with true object ids, for selecting and baking"
     )
-    data: Path | None = Field(default=None, description="those scenes, where they are made already")
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no meshes")
+    data: Path | None = Field(default=None, description="folder of these scenes if they exist already")
+    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no meshes")
 
     def check(self) -> None:
-        """Find the command that makes the scenes, or the scenes."""
+        """Check that the scenes exist, or the command that makes them."""
         if not {"select", "bake"} & set(self.parts):
             return
         if self.data is not None:
@@ -47,7 +47,7 @@ class Applications(Benchmark):
             script_path("tron-datagen")
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each figure.
+        """Measure part by part; write one line per figure to stderr.
 
         Raises:
             StageFailed: the command that makes the scenes failed.
@@ -80,7 +80,7 @@ class Applications(Benchmark):
                         measure_motion(self.seed, outcome)
                     case "meshes":
                         if self.real_data is None or not (self.real_data / "assets").is_dir():
-                            log.warning("no assets in benchmark.real_data=%s: no meshes", self.real_data)
+                            log.warning("no meshes: give benchmark.real_data=FOLDER with assets and hdri")
                         else:
                             measure_meshes(self.real_data, self.seed, outcome)
                     case "viewer":
@@ -88,7 +88,7 @@ class Applications(Benchmark):
         return outcome
 
     def _scenes(self, stages: Stages, folder: Path) -> list[Path]:
-        """Folders of the scenes, which are made on first use."""
+        """Return the folders of the scenes; make the scenes on first use."""
         if self.data is not None:
             return _folders(self.data)
         made = folder / SCENES
@@ -97,7 +97,7 @@ class Applications(Benchmark):
 
 
 def _folders(dataset: Path) -> list[Path]:
-    """Folders of a data set's scenes, sorted; TronError where it has none."""
+    """Return the folders of a data set's scenes, sorted; TronError if it has none."""
     found = sorted(path.parent for path in (dataset / SCENES).glob("*/surfels.ply"))
     if not found:
         raise TronError(

@@ -1,16 +1,16 @@
-"""A thing put into a capture, under the capture's own light, against its photograph pasted in.
+"""Insert a thing into a capture under the capture's light, and compare with pasting its photograph.
 
 Two worlds under different lights. The thing stands in both at one place before one camera, so that its
 photograph in the other world fits into the capture's picture to the pixel. Ours inserts its surfels by
 ``tron-edit`` and lights all of it by the capture's light, as ``tron-relight environment=capture`` does. Truth
-is path tracing of capture and thing together. The capture's light and materials are the true ones: what is
-judged is the insertion, not the reconstruction. Once more they are those that `tron-reconstruct` would write
-beside the capture: found from path-traced photos of it, by the joint fit, on the true geometry.
+is path tracing of capture and thing together. The capture's light and materials are the true ones: the
+insertion is judged, not the reconstruction. A second run takes light and materials from the joint fit of
+`tron-reconstruct` to path-traced photos of the capture, on the true geometry.
 
-Pasted is what a cut and paste does: the true photograph of the capture, the true outline with its covered
-shares, each photograph exposed for its own light; nobody has corrected its colours. It has no error but at
-the thing and where light changes by it; ours has the blur of surfels everywhere. So pixels are judged at the
-thing and where the truth changes by it, and nowhere else.
+The rival is cut and paste: true photographs of capture and thing, each exposed for its own light, composited
+by the true coverage without colour correction. Pasting has errors only at the thing and where the thing
+changes the light; our picture has the blur of surfels everywhere. So only pixels at the thing, and pixels
+where the thing changes the truth, are judged.
 """
 
 from __future__ import annotations
@@ -68,9 +68,9 @@ class Composite:
     """One pair of worlds.
 
     Attributes:
-        name: of the pair.
+        name: name of the pair.
         images: title -> display values (H, W, 3), in the order of the page.
-        thing: (H, W) bool, pixels that show it. cast: those where the light changes by it.
+        thing: (H, W) bool, pixels that show it. cast: pixels where it changes the light.
     """
 
     name: str
@@ -80,7 +80,7 @@ class Composite:
 
 
 def measure_harmonising(seed: int, outcome: Outcome) -> None:
-    """Composites of all pairs: figures and pictures."""
+    """Composite all pairs; add figures and pictures."""
     found = []
     for number in range(WORLDS):
         found.append(composite(seed, number))
@@ -89,7 +89,7 @@ def measure_harmonising(seed: int, outcome: Outcome) -> None:
 
 
 def harmonising_rows(found: Sequence[Composite], seed: int) -> Iterator[Row]:
-    """PSNR of ours and of pasting over the judged pixels, at the thing and beside it, and the gains."""
+    """Yield PSNR of inserting and of pasting on judged pixels, at and beside the thing, and the gains."""
     gains = {}
     for prefix, title in METHODS.items():
         for part, where in (("", "judged"), ("thing_", "thing"), ("cast_", "cast")):
@@ -109,12 +109,12 @@ def harmonising_rows(found: Sequence[Composite], seed: int) -> Iterator[Row]:
 
 
 def judged(found: Composite) -> np.ndarray:
-    """(H, W) bool: the thing, and where the light changes by it."""
+    """(H, W) bool: pixels of the thing, and pixels where it changes the light."""
     return found.thing | found.cast
 
 
 def composite(seed: int, number: int) -> Composite:
-    """A pair of worlds, one under a sun and one in soft light, by turns."""
+    """Composite a pair of worlds; one is under a sun and the other in soft light, in turns."""
     rng = generator(seed, "applications", "harmonise", number, "thing")
     kinds = list(LIGHTS)
     capture, other = (
@@ -154,11 +154,11 @@ def composite(seed: int, number: int) -> Composite:
 
 
 def fitted(capture: World, scene: GaussianScene, seed: int) -> tuple[GaussianScene, EnvironmentMap]:
-    """A capture's surfels with the materials, and the light, that its photographs tell of.
+    """Return a capture's surfels with materials fitted to its photographs, and the fitted light.
 
     Args:
-        capture: that is photographed.
-        scene: its surfels, whose materials are not looked at.
+        capture: world to photograph.
+        scene: surfels of the capture; their materials are ignored.
         seed: root of the random numbers of the photographs and of the fit.
     """
     exposure, views = capture.light.exposure(), []
@@ -171,7 +171,7 @@ def fitted(capture: World, scene: GaussianScene, seed: int) -> tuple[GaussianSce
 
 
 def inserted(scene: GaussianScene, thing: GaussianScene, at: np.ndarray, turn_deg: float) -> GaussianScene:
-    """The scene after an ``insert`` of `tron-edit`: the thing stands on what lies below a point."""
+    """Return the scene after an ``insert`` of `tron-edit`: the thing stands on the surface below a point."""
     with tempfile.TemporaryDirectory() as folder:
         file = Path(folder) / "thing.ply"
         thing.save(file)
@@ -180,7 +180,7 @@ def inserted(scene: GaussianScene, thing: GaussianScene, at: np.ndarray, turn_de
 
 
 def covered(world: World, camera: Camera) -> np.ndarray:
-    """(H, W) share of each pixel that shows the last part of a world."""
+    """Return the share of each pixel that shows the last part of a world, (H, W)."""
     fine = world.surface(camera.resized(MATTE * camera.width, MATTE * camera.height)).number
     last = fine == GROUND + len(world.parts) - 1
     return last.reshape(camera.height, MATTE, camera.width, MATTE).mean((1, 3))

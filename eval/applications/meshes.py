@@ -1,8 +1,8 @@
-"""Real models beside surfels, judged by Mitsuba's path tracer under two photographed lights.
+"""Compare mesh models beside surfels with Mitsuba's path tracer, under two photographed lights.
 
-Models stand on a table. Some of them are meshes, the rest is surfels of the same meshes
-(:func:`tron.models.surfels.surfels_of_model`), so that what is judged is how both are put together. Pictures
-are compared after AgX, in pixels that show one thing alone; shadows where less than 0.8 of the light arrives.
+Models stand on a table. Some are meshes, the others are surfels of the same meshes
+(:func:`tron.models.surfels.surfels_of_model`), so only the combination of both is judged. Pictures are
+compared after AgX in pixels that show one thing alone, shadows where less than 0.8 of the light arrives.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ SPLITS = {"cow": ("cow",), "models": tuple(MODELS), "table": (TABLE,)}
 
 
 def measure_meshes(real_data: Path, seed: int, outcome: Outcome) -> None:
-    """Figures of meshes beside surfels, and pictures under each light.
+    """Measure meshes beside surfels, and show pictures under each light.
 
     Args:
         real_data: folder with ``assets`` and ``hdri``.
@@ -114,7 +114,7 @@ def measure_meshes(real_data: Path, seed: int, outcome: Outcome) -> None:
 
 
 def read_things(real_data: Path) -> dict[str, list[Part]]:
-    """The table and the models, where they stand, world."""
+    """Read the table and the models, placed in the world."""
     things = {TABLE: [_slab()]}
     for name, (file, radius, at, turn) in MODELS.items():
         path = real_data / "assets" / file
@@ -152,11 +152,11 @@ def _surfels(parts: Sequence[Part], name: str, seed: int) -> GaussianScene:
 
 @dataclass(frozen=True)
 class Truth:
-    """What Mitsuba says of the view.
+    """Truth of the view by Mitsuba.
 
     Attributes:
         lit: (H, W, 3) radiance, 4 bounces. irradiance: (H, W, 3) of direct light, over pi.
-        number: (H, W) of the thing that all of a pixel shows, from 1 on; 0 where it shows several or none.
+        number: (H, W) number of the only thing in a pixel, from 1 on; 0 if the pixel shows several or none.
     """
 
     lit: np.ndarray
@@ -165,7 +165,7 @@ class Truth:
 
     @classmethod
     def of(cls, things: Mapping[str, Sequence[Part]], light: EnvironmentMap, seed: int) -> Truth:
-        """Path-traced."""
+        """Path-trace the truth."""
         parts = [(k, part) for k, each in enumerate(things.values(), 1) for part in each]
         shapes = [textured(part, f"true{n}").shape for n, (_, part) in enumerate(parts)]
         white = [_white(part, f"white{n}") for n, (_, part) in enumerate(parts)]
@@ -187,7 +187,7 @@ def _white(part: Part, name: str) -> mi.Mesh:
 
 
 def _numbers(shapes: Sequence[mi.Mesh], numbers: Sequence[int]) -> np.ndarray:
-    """(H, W) number of the thing that nine rays of a pixel meet; 0 where they meet several or none."""
+    """Return the number (H, W) of the thing that a pixel's nine rays hit; 0 if they hit several or none."""
     fine = VIEW.resized(3 * VIEW.width, 3 * VIEW.height)
     along = mi.Vector3f(fine.rays().reshape(-1, 3).T.astype(np.float32))
     si = scene_of(shapes).ray_intersect(mi.Ray3f(mi.Point3f(*VIEW.position.tolist()), along))
@@ -207,7 +207,7 @@ def _lit(
     seed: int,
     estimation: Estimation = FINEST,
 ) -> Illumination:
-    """The things under a light, some of them as meshes."""
+    """Render the things under a light, some of them as meshes."""
     rest = [scene for name, scene in surfels.items() if name not in meshes]
     if not rest:  # a scene has surfels: these let all light through
         table = surfels[TABLE]
@@ -232,7 +232,7 @@ def _time_ratio(
     seed: int,
     estimation: Estimation,
 ) -> float:
-    """Processor time of a frame with the cow as a mesh, over that of all as surfels: medians, in turns."""
+    """Return the CPU time of a frame with the cow as a mesh over a frame of surfels: medians, in turns."""
     pair = [_lit(surfels, things, meshes, light, seed, estimation) for meshes in (SPLITS["cow"], ())]
     taken: list[list[float]] = [[], []]
     for _ in range(TIMED + 1):  # the first compiles

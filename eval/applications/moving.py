@@ -1,9 +1,9 @@
-"""A thing that moves by `tron-relight motion=`, against path tracing of the same meshes moved.
+"""Compare a thing moved by `tron-relight motion=` with path tracing of the same moving meshes.
 
 A thing slides, rises and turns over a few frames before a camera that stands still, as a motion.yaml says.
-Where the surface stayed, what changes from frame to frame is light: the thing's shadow and the colour that it
-lends. Those changes, in display values, are held against the truth's as ``benchmark=renderer`` does
-(:mod:`eval.renderer.shadows`): correlation, and slope of ours over the truth's.
+Where a surface stayed, only light changes from frame to frame: the thing's shadow and its colour bleeding.
+These changes, in display values, are compared with the truth's changes as in ``benchmark=renderer``
+(:mod:`eval.renderer.shadows`): correlation, and slope of our change over the true change.
 """
 
 from __future__ import annotations
@@ -44,7 +44,7 @@ class Film:
     """One world in motion, display values.
 
     Attributes:
-        name: of the world.
+        name: name of the world.
         truth: (K, H, W, 3).
         ours: beginning of a row -> (K, H, W, 3).
         stays: (K - 1, H, W) bool, pixels whose surface stayed until the next frame.
@@ -57,7 +57,7 @@ class Film:
 
 
 def measure_motion(seed: int, outcome: Outcome) -> None:
-    """Film all worlds: figures and pictures."""
+    """Film all worlds; add figures and pictures."""
     films = []
     for number in range(WORLDS):
         films.append(film(seed, number))
@@ -67,7 +67,7 @@ def measure_motion(seed: int, outcome: Outcome) -> None:
 
 
 def motion_rows(films: Sequence[Film], seed: int) -> Iterator[Row]:
-    """Correlation and slope over all changes of all films, and PSNR where surfaces are."""
+    """Yield correlation and slope over all changes of all films, and PSNR on surfaces."""
     for prefix in QUALITIES:
         scenes, sums = [], []
         for each in films:
@@ -96,7 +96,7 @@ def motion_rows(films: Sequence[Film], seed: int) -> Iterator[Row]:
 
 
 def film(seed: int, number: int) -> Film:
-    """A world whose last part moves, under a sun or a soft light by turns."""
+    """Film a world whose last part moves, under a sun or a soft light in turns."""
     rng = generator(seed, "applications", "motion", number, "film")
     world = draw_world(seed, "motion", number, list(LIGHTS)[number % 2])
     thing = draw_thing(rng)
@@ -125,7 +125,7 @@ def film(seed: int, number: int) -> Film:
 
 
 def _truth(moments: Sequence[World], camera: Camera, seed: int) -> tuple[np.ndarray, np.ndarray]:
-    """Display values (K, H, W, 3), and where surfaces stay (K - 1, H, W). One seed: noise stays, too."""
+    """Return display values (K, H, W, 3), and where surfaces stay (K - 1, H, W). One seed keeps the noise."""
     exposure = moments[0].light.exposure()
     frames = np.stack([to_display(each.traced(camera, PATHS, seed), exposure) for each in moments])
     seen = [each.surface(camera) for each in moments]
@@ -139,7 +139,7 @@ def _truth(moments: Sequence[World], camera: Camera, seed: int) -> tuple[np.ndar
 
 
 def _filmed(world: World, motion: Motion, camera: Camera, seed: int) -> dict[str, np.ndarray]:
-    """Frames of the surfels by each quality; one relighter goes through the film, as tron-relight's does."""
+    """Render the surfels by each quality; one relighter serves all frames, as in tron-relight."""
     scene, exposure = world.surfels(SURFELS), world.light.exposure()
     moving = in_motion(motion, scene, motion.end)
     found = {}
@@ -154,7 +154,7 @@ def _filmed(world: World, motion: Motion, camera: Camera, seed: int) -> dict[str
 
 
 def _pictures(film: Film) -> Iterator[tuple[str, Pictures]]:
-    """The frames, and their changes where surfaces stayed: the truth's row, then ours by each quality."""
+    """Show the frames, and their changes where surfaces stayed: a row of truth, then a row per quality."""
     frames, changes = [], []
     rows = {"path-traced": film.truth, **{TITLES[prefix]: each for prefix, each in film.ours.items()}}
     for title, images in rows.items():

@@ -1,8 +1,8 @@
-"""Selections by clicks: a thing out of a scene by three clicks on it and five beside it, drawn at random.
+"""Select a thing of a scene by random clicks: three on the thing and five beside it.
 
-A click is a pixel of one of eight views around the scene, drawn evenly among those that show the thing, or
-anything else. Truth is the object id of every surfel, which the selection does not see. Where a surfel is hit
-by clicks of both kinds the command refuses, and other clicks are drawn, as a user moves one.
+A click is a pixel of one of eight views around the scene, drawn evenly among the pixels that show the thing,
+or among the other pixels. The truth is the object id of every surfel, which the selection does not see. If
+clicks of both kinds hit one surfel, the command refuses, and clicks are drawn again, as a user moves one.
 """
 
 from __future__ import annotations
@@ -52,7 +52,7 @@ class Draw:
 
     Attributes:
         scene: its name. number: the thing's object id. clicks: (x, y) by view, inside and outside.
-        selected: (M,) bool. iou: of it and the truth. refused: draws of clicks that were refused before.
+        selected: (M,) bool. iou: IoU with the truth. refused: number of draws that were refused before.
     """
 
     scene: str
@@ -64,7 +64,7 @@ class Draw:
 
 
 class Clicked:
-    """A scene and what its views show."""
+    """A scene and the surfels seen in its views."""
 
     def __init__(self, name: str, scene: GaussianScene) -> None:
         self.name, self.scene = name, scene
@@ -81,7 +81,7 @@ class Clicked:
         """(V, H, W) object ids, -1 where there is nothing."""
 
     def things(self) -> list[int]:
-        """Object ids that enough pixels show; none where nothing else is in the scene."""
+        """Return object ids with enough pixels; none if the scene has a single object."""
         ids, counts = np.unique(self.shown[self.shown >= 0], return_counts=True)
         return [int(i) for i, count in zip(ids, counts) if count > LEAST_PIXELS and len(ids) > 1]
 
@@ -102,14 +102,14 @@ class Clicked:
 
 
 def _clicks(where: np.ndarray, count: int, side: str, rng: np.random.Generator) -> Iterator[Clicks]:
-    """``count`` pixels of (V, H, W) bool, each a click in its view."""
+    """Draw ``count`` pixels of (V, H, W) bool as clicks in their views."""
     pixels = np.argwhere(where)
     for view, y, x in pixels[rng.choice(len(pixels), count, replace=False)].tolist():
         yield Clicks.model_validate({side: [(x + 0.5, y + 0.5)], "view": view})
 
 
 def measure_selections(folders: list[Path], seed: int, outcome: Outcome) -> None:
-    """Figures over all things of the scenes, pictures of some, and the time of a large one."""
+    """Measure selections of all things of the scenes, show some, and time a large one."""
     draws = list[Draw]()
     for k, folder in enumerate(folders):
         clicked = Clicked(folder.name, GaussianScene.load(folder / "surfels.ply"))
@@ -124,7 +124,7 @@ def measure_selections(folders: list[Path], seed: int, outcome: Outcome) -> None
 
 
 def selection_rows(draws: list[Draw], seed: int) -> Iterator[Row]:
-    """Mean, median and share of good ones; ``seed`` draws the scenes of the intervals."""
+    """Yield mean and median IoU and the share of good selections; ``seed`` draws the intervals' scenes."""
     yield mean_row("select.iou", "1", [(draw.scene, draw.iou) for draw in draws], seed)
     ious = [draw.iou for draw in draws]
     yield Row(metric="select.iou_median", value=float(np.median(ious)), unit="1", n=len(ious))
@@ -139,7 +139,7 @@ def selection_rows(draws: list[Draw], seed: int) -> Iterator[Row]:
 
 
 def seconds_rows(seed: int) -> Iterator[Row]:
-    """Seconds of one selection among LARGE surfels, clicks and all; first the one that makes the tracer."""
+    """Yield seconds of a selection among LARGE surfels, clicks included; the first one builds the tracer."""
     world = draw_world(seed, "large", 0, "soft", things=5)
     clicked = Clicked("large", world.surfels(LARGE))
     wall, processor = [], []
@@ -155,7 +155,7 @@ def seconds_rows(seed: int) -> Iterator[Row]:
 
 
 def _pictures(clicked: Clicked, draw: Draw) -> Pictures:
-    """The view with most clicks on the thing: its colours and clicks, the selection, the truth."""
+    """Show the view with most clicks on the thing: colours with clicks, selection, truth."""
     inside = [click.view for click in draw.clicks if click.inside]
     view = max(set(inside), key=inside.count)
     camera = clicked.views[str(view)].resized(2 * SIDE, 2 * SIDE)
@@ -184,6 +184,6 @@ def _pictures(clicked: Clicked, draw: Draw) -> Pictures:
 
 
 def _shown(scene: GaussianScene, camera: Camera, values: np.ndarray) -> np.ndarray:
-    """(H, W, 3) values (M, 3) of the surfels, in [0, 1], as a camera sees them over black."""
+    """Render values (M, 3) of the surfels in [0, 1] over black: (H, W, 3)."""
     seen = SurfelTracer(replace(scene, base_color=values)).gbuffer(camera).numpy()
     return seen["opacity"][..., None] * seen["base_color"]

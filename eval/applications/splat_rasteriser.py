@@ -1,4 +1,4 @@
-"""What a 3DGS viewer draws of a PLY, in float64 NumPy and apart from tron's reader, harmonics and tracer.
+"""3DGS viewer in float64 NumPy, independent of TRON's reader, harmonics and tracer.
 
 Splatting by Zwicker et al. 2001 (EWA) with the choices of Kerbl et al. 2023 and of its reference code:
 projected covariances J W S W' J' with 0.3 pixels added, at most 0.99 and at least 1/255 of opacity, up to the
@@ -23,13 +23,13 @@ NEAREST = 0.2
 def rasterise(
     path: Path, camera: Camera, variance: float = 0.3, compensated: bool = False
 ) -> tuple[np.ndarray, np.ndarray]:
-    """(H, W, 3) display values over black, and (H, W) opacity.
+    """Render display values (H, W, 3) over black, and opacity (H, W).
 
     Args:
         path: PLY of 3DGS, with harmonics of degree 0 to 3.
         camera: the view.
         variance: added to projected covariances, square pixels.
-        compensated: opacity is lowered by what that widens, as by 3DGS's ``--antialiasing``.
+        compensated: lower the opacity to compensate for ``variance``, as 3DGS's ``--antialiasing`` does.
     """
     vertex = plyfile.PlyData.read(str(path))["vertex"]
 
@@ -83,7 +83,7 @@ def rasterise(
 
 
 def _tiles(middle: np.ndarray, reach: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """First pixels, and those behind the last, of the tiles that reach touches."""
+    """Return the first pixels, and the pixels after the last, of the tiles within reach."""
     first, last = np.floor((middle - reach) / TILE), np.floor((middle + reach + TILE - 1) / TILE)
     return np.clip(TILE * first, 0, size).astype(int), np.clip(TILE * last, 0, size).astype(int)
 
@@ -99,7 +99,7 @@ def _rotations(quats: np.ndarray) -> np.ndarray:
 
 
 def _basis(x: np.ndarray, y: np.ndarray, z: np.ndarray) -> np.ndarray:
-    """(M, 16) as utils/sh_utils.py of the reference code writes them."""
+    """Return the harmonics (M, 16), as in utils/sh_utils.py of the reference code."""
     xx, yy, zz, xy, yz, xz = x * x, y * y, z * z, x * y, y * z, x * z
     functions = [
         0.28209479177387814 + 0 * x,

@@ -1,8 +1,8 @@
-"""Frames a second of the viewer, by its studio without a browser, inputs coming as from a hand.
+"""Frames per second of the viewer's studio, without a browser, under simulated user input.
 
-A hand is played by wishes at 40 Hz. Frames are the pictures that the studio hands out while it moves; they
-may be smaller than the window, and their size is reported. Processor time is that of the whole process, over
-all threads, so that it holds on a machine that does other things too.
+Simulated inputs arrive at 40 Hz. Frames are the pictures that the studio returns while something moves; they
+may be smaller than the window, and their size is reported. CPU time is summed over all threads of the
+process, so it holds on a machine with other load too.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ KINDS = ("camera", "light", "material", "object")
 
 
 class Gallery:
-    """Pictures as they come, with their times and views."""
+    """Pictures from the studio, with their times and views."""
 
     def __init__(self) -> None:
         self.pictures: list[tuple[float, int, Picture]] = []
@@ -59,12 +59,12 @@ class Gallery:
             self._came.notify_all()
 
     def clear(self) -> None:
-        """Forget all of them."""
+        """Forget all pictures."""
         with self._came:
             self.pictures.clear()
 
     def until(self, holds: Callable[[float, int, Picture], bool]) -> float:
-        """Wait for a picture that something holds of; when it came.
+        """Wait for a picture that meets a condition; return its time.
 
         Raises:
             TronError: none did within PATIENCE seconds.
@@ -81,17 +81,17 @@ class Gallery:
         return when
 
     def rough(self, view: int = 0) -> list[Picture]:
-        """Pictures of a view that were drawn while something moved."""
+        """Return the pictures of a view that were drawn while something moved."""
         with self._came:
             return [picture for _, of, picture in self.pictures if of == view and picture.refined == 0]
 
 
 @dataclass(frozen=True)
 class Hand:
-    """Inputs of one kind after another.
+    """Simulated user input, one kind after another.
 
     Attributes:
-        studio: that they go to. world: what it shows. home: camera that they start from.
+        studio: receiver of the inputs. world: world on show. home: start camera.
     """
 
     studio: Studio
@@ -99,7 +99,7 @@ class Hand:
     home: Camera
 
     def move(self, kind: str, step: int) -> None:
-        """The input number ``step`` of a kind, another each time."""
+        """Send input number ``step`` of a kind; every step differs."""
         thing = Selection(object=GROUND + 1)
         match kind:
             case "camera":
@@ -114,7 +114,7 @@ class Hand:
                 self.studio.wish(edits=(Move(select=thing, by=by),))
 
     def play(self, kind: str, first: int, goes_on: Callable[[float], bool]) -> tuple[int, float]:
-        """Inputs at HERTZ while ``goes_on(seconds)``; the number of the next one, and the seconds."""
+        """Send inputs at HERTZ while ``goes_on(seconds)``; return the next step's number, and the seconds."""
         began, step = time.perf_counter(), first
         while goes_on(time.perf_counter() - began):
             self.move(kind, step)
@@ -124,19 +124,19 @@ class Hand:
 
 
 def turned(camera: Camera, degrees: float) -> Camera:
-    """The camera turned about the world's up."""
+    """Return the camera turned about the world's up."""
     angle = np.radians(degrees)
     c, s = np.cos(angle), np.sin(angle)
     return turn_cameras([camera], np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]]))[0]
 
 
 def measure_viewer(seed: int, outcome: Outcome, threads: int | None) -> None:
-    """All figures of the studio, some two minutes.
+    """Measure all figures of the studio, some two minutes.
 
     Args:
-        seed: of the world and of all rays.
-        outcome: that rows go to.
-        threads: of Dr.Jit; None: as it is.
+        seed: seed of the world and of all rays.
+        outcome: receives the rows.
+        threads: threads of Dr.Jit; None: unchanged.
     """
     world = draw_world(seed, "viewer", 0, "sun", things=4)
     home = view_of(generator(seed, "applications", "viewer", "camera"), *SIZE)
@@ -156,7 +156,7 @@ def measure_viewer(seed: int, outcome: Outcome, threads: int | None) -> None:
 
 
 def _frames(hand: Hand, gallery: Gallery, kind: str) -> Iterator[Row]:
-    """Frames a second of one kind, their processor time, and the width that they had."""
+    """Measure frames per second under one kind of input, their CPU time and their width."""
     step, _ = hand.play(kind, 1, lambda since: since < 2)
     gallery.clear()
     spent = time.process_time()
@@ -171,7 +171,7 @@ def _frames(hand: Hand, gallery: Gallery, kind: str) -> Iterator[Row]:
 
 
 def _kernels(hand: Hand, gallery: Gallery) -> Iterator[Row]:
-    """Kernels that COUNTED frames of each kind launch and none of the first frames of any kind did.
+    """Count kernels that COUNTED frames of each kind launch and that no first frame of any kind launched.
 
     A fresh machine compiles these. Dr.Jit's own ``cache_hit`` is true as well for what another run left on
     this one's disk.
@@ -192,7 +192,7 @@ def _kernels(hand: Hand, gallery: Gallery) -> Iterator[Row]:
 
 @contextmanager
 def _kernel_history(studio: Studio) -> Iterator[Callable[[], set[str]]]:
-    """Names of the kernels that the studio has launched since the last call, or since the beginning."""
+    """Yield a call that returns the kernels that the studio launched in the block."""
 
     def launched() -> set[str]:
         history = _asked(studio, lambda _: dr.kernel_history([dr.KernelType.JIT]))
@@ -207,7 +207,7 @@ def _kernel_history(studio: Studio) -> Iterator[Callable[[], set[str]]]:
 
 
 def _two_clients(hand: Hand, gallery: Gallery) -> Iterator[Row]:
-    """Frames of the slower of two views over those of the faster, both turning."""
+    """Yield a row: frame count of the slower of two turning views over the faster view's."""
     cameras = hand.home, turned(hand.home, 150)
     for view, camera in enumerate(cameras):
         hand.studio.look(view, camera)
@@ -226,7 +226,7 @@ def _two_clients(hand: Hand, gallery: Gallery) -> Iterator[Row]:
 
 
 def _interrupts(hand: Hand, gallery: Gallery) -> Iterator[Row]:
-    """Milliseconds from an input amid a pass of a large frame to its first picture."""
+    """Measure milliseconds from an input during a pass of a large frame to its first picture."""
     large, found = hand.home.resized(*LARGE), []
     hand.studio.look(0, large)
     for number in range(INTERRUPTS):
@@ -243,7 +243,7 @@ def _interrupts(hand: Hand, gallery: Gallery) -> Iterator[Row]:
 
 
 def _at_rest(studio: Studio, gallery: Gallery) -> None:
-    """Wait for the last picture of the wish of the moment."""
+    """Wait for the last picture of the current request."""
     wish = studio.wished
     gallery.until(lambda *each: each[2].refined == 1 and each[2].wish == wish)
     gallery.clear()

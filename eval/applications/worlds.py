@@ -1,8 +1,8 @@
-"""Small worlds drawn from seeds, as meshes for Mitsuba and as surfels of the same meshes, and their truth.
+"""Small random worlds, as meshes for Mitsuba and as surfels of the same meshes, with their truth.
 
-Things of plain shapes stand on a patterned ground under an open sky. Surfels are what ``tron-edit`` makes of
-a model (:func:`tron.models.surfels.surfels_of_model`): their places and materials are true, so that what is
-judged is the light. Mitsuba's path tracer, which shares no code with TRON's, sees the meshes.
+Things of plain shapes stand on a patterned ground under an open sky. Surfels are made as in ``tron-edit``
+(:func:`tron.models.surfels.surfels_of_model`): their positions and materials are exact, so only the light is
+judged. Mitsuba's path tracer, which shares no code with TRON's, sees the meshes.
 """
 
 from __future__ import annotations
@@ -41,8 +41,8 @@ class World:
     """Meshes under a light.
 
     Attributes:
-        parts: the ground, then the things; the number of each is its place, from :data:`GROUND` on.
-        light: around them.
+        parts: the ground, then the things, numbered in this order from :data:`GROUND` on.
+        light: environment of the meshes.
         seed: root of their random numbers.
     """
 
@@ -51,18 +51,18 @@ class World:
     seed: int
 
     def surfels(self, count: int) -> GaussianScene:
-        """About ``count`` surfels, evenly by area, with the numbers of the parts as object ids."""
+        """Return about ``count`` surfels, evenly by area, with the parts' numbers as object ids."""
         return surfels_of(self.parts, np.sqrt(self.area / count), self.seed)
 
     @property
     def area(self) -> float:
-        """Of all surfaces, world units squared."""
+        """Area of all surfaces, world units squared."""
         corners = [part.vertices[part.faces] for part in self.parts]
         crosses = [np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]) for c in corners]
         return float(sum(0.5 * np.linalg.norm(each, axis=1).sum() for each in crosses))
 
     def traced(self, camera: Camera, spp: int, seed: int) -> np.ndarray:
-        """(H, W, 3) linear radiance by Mitsuba's path tracer."""
+        """Render linear radiance (H, W, 3) by Mitsuba's path tracer."""
         scene = _mitsuba(self.parts, self.light)
         sensor = mitsuba_sensor(camera, spp)
         sensor["sampler"]["type"] = "multijitter"
@@ -73,7 +73,7 @@ class World:
         return np.array(image)[..., :3]
 
     def surface(self, camera: Camera) -> TrueSurface:
-        """What Mitsuba's rays through the pixels' centres meet."""
+        """Return the surface hit by Mitsuba's rays through the pixel centres."""
         scene = _mitsuba(self.parts, None)
         along = camera.rays().reshape(-1, 3)
         origin, direction = (mi.Point3f(*camera.position.tolist()), mi.Vector3f(*along.T.astype(np.float32)))
@@ -108,7 +108,7 @@ class TrueSurface(NamedTuple):
 
 
 def draw_world(seed: int, name: str, number: int, light: str, things: int = 3) -> World:
-    """A world of a benchmark's part.
+    """Draw a world for a part of a benchmark.
 
     Args:
         seed: root of all random numbers.
@@ -125,7 +125,7 @@ def draw_world(seed: int, name: str, number: int, light: str, things: int = 3) -
 
 
 def draw_ground(rng: np.random.Generator) -> Part:
-    """Checks or stripes of two colours, or blotches between them, matt."""
+    """Draw a matt ground with checks, stripes or blotches of two colours."""
     side = np.linspace(-HALF, HALF, CELLS + 1)
     x, y = (each.ravel() for each in np.meshgrid(side, side))
     angle, period = rng.uniform(0, np.pi), rng.uniform(0.4, 0.9)
@@ -149,7 +149,7 @@ def draw_ground(rng: np.random.Generator) -> Part:
 
 
 def draw_thing(rng: np.random.Generator) -> Part:
-    """A ball, a box, a lying ring, a vase, or a ball on a box, of one material; it stands on the origin."""
+    """Draw a ball, box, lying ring, vase, or ball on a box, of one material, standing on the origin."""
     size = float(rng.uniform(0.32, 0.5))
     kind = rng.integers(5)
     shapes: list[Surface]
@@ -203,7 +203,7 @@ class Vase(Surface):
         return float(np.pi * ((radius[1:] + radius[:-1]) * np.hypot(np.diff(radius), np.diff(height))).sum())
 
     def at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and normals; v runs from the foot's middle to the top's."""
+        """Return points and normals; v runs from the centre of the foot to the centre of the top."""
         radius, height = self._profile(v)
         step = 1e-5
         (r0, z0), (r1, z1) = (self._profile(np.clip(v + d, 0, 1)) for d in (-step, step))
@@ -214,7 +214,7 @@ class Vase(Surface):
         return np.stack([radius * c, radius * s, height], axis=1), normals
 
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Foot, side and top apart, so that their edges stay sharp."""
+        """Return lattices of foot, side and top; separate lattices keep the edges sharp."""
         around = np.linspace(0, 1, fineness + 1)
         ends = ((1e-4, 0.1 - 1e-4), (0.1 + 1e-4, 0.9 - 1e-4), (0.9 + 1e-4, 1 - 1e-4))
         return [(around, np.linspace(*end, fineness // 2 + 1)) for end in ends]
@@ -233,7 +233,7 @@ def moved(
     turn_deg: float = 0.0,
     about: Sequence[float] | np.ndarray = (0, 0, 0),
 ) -> Part:
-    """The part turned counter-clockwise about a vertical axis through a point, then shifted."""
+    """Turn a part counter-clockwise about a vertical axis through a point, then shift it."""
     c, s = np.cos(np.radians(turn_deg)), np.sin(np.radians(turn_deg))
     rotation = np.array([[c, -s, 0], [s, c, 0], [0, 0, 1]])
     vertices = (part.vertices - about) @ rotation.T + about + np.asarray(shift)
@@ -241,7 +241,7 @@ def moved(
 
 
 def surfels_of(parts: Sequence[Part], spacing: float, seed: int, first: int = GROUND) -> GaussianScene:
-    """Surfels of parts at one spacing, numbered from ``first`` on."""
+    """Return surfels of parts at one spacing; parts are numbered from ``first`` on."""
     scenes = [
         surfels_of_model([part], spacing, object_id=first + n, seed=integer(seed, n))
         for n, part in enumerate(parts)
@@ -255,7 +255,7 @@ def surfels_of(parts: Sequence[Part], spacing: float, seed: int, first: int = GR
 def view_of(
     rng: np.random.Generator, width: int, height: int, target: Sequence[float] = (0, 0.1, 0.3)
 ) -> Camera:
-    """A camera before the things, 3.6 units from the middle, 22 to 40 degrees high."""
+    """Draw a camera that faces the things, 3.6 units from the middle, 22 to 40 degrees high."""
     azimuth, elevation = np.radians(rng.uniform(-125, -55)), np.radians(rng.uniform(22, 40))
     level = np.cos(elevation)
     toward = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
@@ -270,7 +270,7 @@ def _mitsuba(parts: Sequence[Part], light: EnvironmentMap | None) -> mi.Scene:
 
 
 def _mesh(name: str, part: Part) -> mi.Mesh:
-    """A mesh whose colours stand at its vertices, of :mod:`tron.brdf`, which both sides have."""
+    """Return a two-sided Mitsuba mesh with vertex colours and the material of :mod:`tron.brdf`."""
     colors = {"type": "mesh_attribute", "name": "vertex_color"}
     material = metallic_roughness(colors, part.roughness, part.metallic)
     properties = mi.Properties()

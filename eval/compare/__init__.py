@@ -1,1 +1,1 @@
-"""Benchmark `compare`: folders of pictures, ours and anyone's, judged alike on a suite."""
+"""Benchmark `compare`: score folders of pictures, ours and anyone's, by the same rules on a suite."""

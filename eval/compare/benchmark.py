@@ -1,4 +1,4 @@
-"""Benchmark `compare`: every method's folder on a suite, by the same figures, nobody treated specially."""
+"""Benchmark `compare`: score every method's folder on a suite by the same figures."""
 
 from __future__ import annotations
 
@@ -44,18 +44,20 @@ EXACT = 2**13
 
 
 class Compare(Benchmark):
-    """Settings: the suite, the methods, and how much of them is shown."""
+    """Settings: the suite, the methods, and the number of pictures on the page."""
 
     name: ClassVar[str] = "compare"
 
-    suite: Path | None = Field(description="folder that tron-eval export=SUITE wrote")
+    suite: Path | None = Field(description="folder written by tron-eval export=SUITE")
     methods: list[Path] | Path | None = Field(
         description="folder of methods' folders, or a list of methods' folders ([a,b])"
     )
     lpips: Path | None = Field(
         description="vgg16-397923af.pth of torchvision, for LPIPS; null: no LPIPS (nothing is downloaded)"
     )
-    pictures: NonNegativeInt = Field(description="scenes and lights that are shown, to slide between methods")
+    pictures: NonNegativeInt = Field(
+        description="number of scenes and lights on the page, with a slider between methods"
+    )
     seed: int = 0
 
     def check(self) -> None:
@@ -65,7 +67,7 @@ class Compare(Benchmark):
             LPIPS.load(self.lpips)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Judge every method, then put them side by side."""
+        """Judge every method, then show them side by side."""
         suite, folders = self._read()
         lpips = None if self.lpips is None else LPIPS.load(self.lpips)
         if not importlib.util.find_spec("flip_evaluator"):
@@ -104,7 +106,7 @@ class Compare(Benchmark):
         return suite, find_methods(self.methods, suite)
 
     def _show(self, outcome: Outcome, suite: Suite, judged: Sequence[Judged]) -> None:
-        """Middle frames of scenes and lights, evenly spaced among those that all methods have."""
+        """Show middle frames of scenes and lights, evenly spaced among the lights that all methods have."""
         common = common_scenes(judged)
         pairs = [(s, light) for s in suite.scenes.values() if s.name in common for light in judged_lights(s)]
         places = np.linspace(0, len(pairs) - 1, min(self.pictures, len(pairs))).round().astype(int)
@@ -136,7 +138,7 @@ class Compare(Benchmark):
 
 
 def find_methods(given: Path | Sequence[Path], suite: Suite) -> list[MethodFolder]:
-    """Folders of methods, by their names; TronError where there are none, or two of one name."""
+    """Return method name -> folder; TronError if there are none, or two of one name."""
     if isinstance(given, Path):
         folders = (
             [given]
@@ -159,12 +161,12 @@ def find_methods(given: Path | Sequence[Path], suite: Suite) -> list[MethodFolde
 
 
 def rows_of(judged: Sequence[Judged], scenes: set[str], seed: int) -> Iterator[Row]:
-    """Means, gains and their p-values; what cannot be said of all scenes is not said.
+    """Yield rows of means, gains and p-values; a mean over all scenes needs all scenes.
 
-    - ``METHOD.FIGURE``: mean over all pictures of all scenes, if no scene failed; ``.GROUP`` is of
-      one kind of scene or family of lights; ``METHOD.FIGURE_common`` where some method failed somewhere:
-      of the scenes that all have.
-    - ``METHOD.faults``, ``METHOD.scene_psnr.SCENE``; ``METHOD.seconds_fit`` and ``_frame`` as it says.
+    - ``METHOD.FIGURE``: mean over all pictures of all scenes, if no scene failed; ``.GROUP`` is
+      for one kind of scene or family of lights. If any method failed anywhere, ``METHOD.FIGURE_common``
+      is the mean over the scenes that all methods have.
+    - ``METHOD.faults``, ``METHOD.scene_psnr.SCENE``; ``METHOD.seconds_fit`` and ``_frame`` from its yaml.
     - ``A.gain_over_B``: mean difference of PSNR on the same pictures; ``A.p_over_B``: see :func:`p_values`.
     """
     common = common_scenes(judged)
@@ -201,7 +203,7 @@ def rows_of(judged: Sequence[Judged], scenes: set[str], seed: int) -> Iterator[R
 
 
 def _pairs(judged: Sequence[Judged], common: set[str], seed: int) -> Iterator[Row]:
-    """Gains of the better of each two methods on the common scenes, with their p-values."""
+    """Yield the gain of the better of every two methods on the common scenes, with p-values."""
     by_method = {each.name: _by_picture(each.frames, common) for each in judged}
     gains: list[Row] = []
     differences: list[np.ndarray] = []
@@ -225,10 +227,10 @@ def _pairs(judged: Sequence[Judged], common: set[str], seed: int) -> Iterator[Ro
 
 
 def p_values(differences: Sequence[np.ndarray], seed: int) -> list[float | None]:
-    """Two-sided p-values of paired differences (n scenes) of each pair, for no difference in the mean.
+    """Return two-sided p-values of each pair's differences (n scenes), for no difference in the mean.
 
     Signs are flipped scene by scene (a permutation test, exact up to EXACT flips), and p-values of all
-    pairs are adjusted together by Benjamini and Hochberg's procedure. None of fewer than LEAST scenes.
+    pairs are adjusted together by Benjamini and Hochberg's procedure. None for fewer than LEAST scenes.
     """
     raw = [
         None
@@ -259,5 +261,5 @@ def _by_picture(frames: Sequence[FrameScore], scenes: set[str]) -> dict[tuple[st
 
 
 def slug(name: str) -> str:
-    """A name as rows may have it."""
+    """Return a name in the form that rows allow."""
     return re.sub(r"[^a-z0-9]+", "_", name.lower()).strip("_") or "_"

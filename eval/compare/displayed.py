@@ -1,4 +1,4 @@
-"""Methods' pictures as they are seen, for what looks at pictures and not at figures: judges and clips."""
+"""Methods' pictures in display values, for judges and clips, which look at pictures."""
 
 from __future__ import annotations
 
@@ -18,10 +18,10 @@ TRUTH = "truth"
 
 
 def methods_and_truth(given: Path | Sequence[Path], suite: Suite) -> dict[str, MethodFolder | None]:
-    """Name -> folder of every method, and TRUTH, None, where the suite knows all of it.
+    """Return method name -> folder, and TRUTH -> None if the suite has the whole truth.
 
     Raises:
-        TronError: there is no method, one is damaged or of another suite, or two share a name.
+        TronError: there is no method, a method is damaged or of another suite, or two share a name.
     """
     found: dict[str, MethodFolder | None] = {each.method.name: each for each in find_methods(given, suite)}
     if TRUTH in found:
@@ -35,10 +35,10 @@ def methods_and_truth(given: Path | Sequence[Path], suite: Suite) -> dict[str, M
 def displayed(
     suite: Suite, scene: SuiteScene, folder: MethodFolder | None
 ) -> Iterator[tuple[str, np.ndarray]]:
-    """Each light's pictures (K, H, W, 3) by a method, None: by the suite itself, display float32.
+    """Yield light -> pictures (K, H, W, 3) of a method, or of the suite for None; display float32.
 
-    As benchmark=compare judges them: the factor of methods that ask for one, and the truth behind the
-    subject where not both have the environment there, if it is known.
+    Pictures are prepared as in benchmark=compare: with the factor of methods that ask for one, and with the
+    known truth behind the subject unless both have the environment there.
 
     Raises:
         Fault: what is wrong with them.

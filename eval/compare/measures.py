@@ -1,4 +1,4 @@
-"""Figures that methods are compared by, as rows and tables name them."""
+"""Figures of comparisons of methods, with their names in rows and tables."""
 
 from __future__ import annotations
 
@@ -8,7 +8,7 @@ from eval.relighting.scores import METRICS
 
 
 class Measure(NamedTuple):
-    """A figure of a relit picture, in rows and tables.
+    """Name of a figure of relit pictures in rows and tables.
 
     Attributes:
         name, unit, title: as of :class:`eval.relighting.scores.Metric`.

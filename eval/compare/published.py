@@ -1,4 +1,4 @@
-"""What the TRON paper prints of material decompositions, called the paper's wherever it is shown.
+"""Material decomposition figures of the TRON paper; pages label them as the paper's.
 
 Source: its table "Quantitative Material Decompositions Comparison". Base color is scaled for each view and
 channel by least squares. Its TRON-Synth has other models and lights than ours, 800 x 800 pixels.
@@ -53,7 +53,7 @@ _SHOWN = ("{:.2f} dB", "{:.3f}", "{:.3f}", "{:.2f}°")
 
 
 def published(suite: str) -> list[Table]:
-    """The paper's tables of a suite, by its name or id; none of any other."""
+    """Return the paper's tables for a suite, by the suite's name or id; none for other suites."""
     places = next((found for name, found in _PLACES.items() if suite.startswith(name)), ())
     return [
         Table(

@@ -1,12 +1,12 @@
-"""Figures of a method's folder on a suite: every picture against the truth, and every fault by its name.
+"""Score a method's folder on a suite: every picture against the truth, and every fault by name.
 
-Pictures are judged as they are seen: exposed by the suite, through its tone curve. Three colour spaces come
-to that in their own ways (:func:`shown`). A figure is taken of the foreground, pixels that surfaces cover
-altogether; where method and suite have the same environment behind them also of the whole frame. Metrics
-that look at neighbours (SSIM, FLIP, LPIPS) are given the truth around the foreground of any other method.
+Pictures are judged in display values: the suite's exposure and tone curve apply, as :func:`shown` does for
+each of three colour spaces. Figures are over the foreground, pixels that surfaces cover fully; if method and
+suite have the same environment behind it, also over the whole frame. For all other methods, metrics that
+look at neighbours (SSIM, FLIP, LPIPS) see the truth around the foreground.
 
-A scene one of whose pictures is at fault has no figures at all: a mean over what happened to be there would
-favour who left out what is hard.
+A scene with any faulty picture has no figures at all: a mean over the remaining pictures would favour methods
+that leave out hard ones.
 """
 
 from __future__ import annotations
@@ -37,7 +37,7 @@ SWAPPED = 0.5
 
 @dataclass(frozen=True)
 class FrameScore:
-    """Figures of one picture; names end in ``_full`` where they are of the whole frame."""
+    """Figures of one picture; names that end in ``_full`` are over the whole frame."""
 
     scene: str
     kind: str
@@ -49,7 +49,7 @@ class FrameScore:
 
 @dataclass(frozen=True)
 class FoundFault:
-    """A fault: where, of which kind, and in a sentence."""
+    """A fault: its place, its kind, and a sentence about it."""
 
     scene: str
     what: str
@@ -59,14 +59,14 @@ class FoundFault:
 
 @dataclass
 class Judged:
-    """All that was found of a method.
+    """Scores and faults of a method.
 
     Attributes:
-        frames: of the scenes without a fault in their relit pictures.
+        frames: scores in the scenes whose relit pictures have no fault.
         maps: scene -> figures of MAP_MEASURES, means over views.
         factors: scene -> the factor on its light, of methods that ask for one.
         faults: in the suite's order.
-        missing: maps that the method does not give and the suite could judge.
+        missing: maps that the suite could judge and the method lacks.
     """
 
     folder: MethodFolder
@@ -78,12 +78,12 @@ class Judged:
 
     @property
     def name(self) -> str:
-        """In rows."""
+        """Name of the method in rows."""
         return self.folder.method.name
 
     @property
     def whole(self) -> set[str]:
-        """Scenes that have figures."""
+        """Scenes with figures."""
         return {score.scene for score in self.frames}
 
 
@@ -91,12 +91,12 @@ Score = Callable[[np.ndarray, np.ndarray, np.ndarray | None], dict[str, float]]
 
 
 def judged_lights(scene: SuiteScene) -> list[str]:
-    """Lights of a scene whose truth is known."""
+    """Return the lights of a scene with known truth."""
     return [name for name, light in scene.lights.items() if light.truth]
 
 
 def foreground(scene: SuiteScene) -> np.ndarray:
-    """(K, H, W) bool: pixels that show nothing but surfaces; all of them where the suite has no masks."""
+    """(K, H, W) bool: pixels that show only surfaces; all pixels if the suite has no masks."""
     mask = scene.mask()
     if mask is None:
         return np.ones((scene.entry.frames, scene.size.height, scene.size.width), bool)
@@ -104,7 +104,7 @@ def foreground(scene: SuiteScene) -> np.ndarray:
 
 
 def judge_method(suite: Suite, folder: MethodFolder, lpips: LPIPS | None = None) -> Judged:
-    """Read and score all that a method's folder holds, a scene in memory at a time."""
+    """Read and score a method's folder, one scene in memory at a time."""
     found = Judged(folder)
     for scene in suite.scenes.values():
         inside = foreground(scene)
@@ -156,7 +156,7 @@ def _judge_lights(
 def shown(
     suite: Suite, folder: MethodFolder, frames: np.ndarray, exposure: float, factor: float = 1.0
 ) -> np.ndarray:
-    """Pictures as they are seen, (..., 3) display float32: the suite's exposure, factor and tone curve."""
+    """Return display pictures, (..., 3) float32: apply the suite's exposure, a factor and the tone curve."""
     match folder.method.color_space:
         case "display":
             return np.clip(frames, 0, 1)
@@ -174,7 +174,7 @@ def scene_factor(
     truths: Mapping[str, np.ndarray],
     inside: np.ndarray,
 ) -> float:
-    """The factor on a method's light in a scene (:func:`eval.light_scale.fitted_factor`), of all its lights.
+    """Fit one factor on a method's radiance in a scene, over all lights: `eval.light_scale.fitted_factor`.
 
     Args:
         suite, scene, folder: whose pictures they are.
@@ -195,7 +195,7 @@ def scene_factor(
 def picture_figures(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, lpips: LPIPS | None
 ) -> dict[str, float]:
-    """Figures of display values (H, W, 3) in [0, 1]; ``mask`` (H, W) counts, None: all pixels."""
+    """Score display values (H, W, 3) in [0, 1] on the pixels of ``mask`` (H, W); None: all pixels."""
     least = min(image.shape[:2])
     small = {"ssim"} if least < 6 else set()
     figures = {each.name: each.measure(image, truth, mask) for each in METRICS if each.name not in small}
@@ -205,7 +205,7 @@ def picture_figures(
 
 
 def hdr_figures(exposed: np.ndarray, truth: np.ndarray, mask: np.ndarray) -> dict[str, float]:
-    """HDR-FLIP of exposed linear radiance (H, W, 3) on a foreground, its median colour around it.
+    """HDR-FLIP of exposed linear radiance (H, W, 3) on a foreground; its median colour fills the rest.
 
     HDR-FLIP finds its range of exposures from the reference, where black surroundings would mislead it.
     """
@@ -259,10 +259,10 @@ def _known(maps: np.ndarray | None) -> np.ndarray:
 def albedo_figures(
     given: np.ndarray, truth: np.ndarray, inside: np.ndarray, lpips: LPIPS | None = None
 ) -> dict[str, float]:
-    """Means over views of linear base color (K, H, W, 3) on the foreground, by all three scalings.
+    """Score linear base color (K, H, W, 3) on the foreground under three scalings, as means over views.
 
-    TRON scales each view and channel by least squares, TensoIR, GS-IR and IRGS each scene and channel by the
-    median ratio; unscaled is as the method gives it. Scaled values are clipped to [0, 1].
+    TRON scales each view and channel by least squares; TensoIR, GS-IR and IRGS scale each scene and channel
+    by the median ratio; the third scaling is none. Scaled values are clipped to [0, 1].
     """
     views = [k for k, mask in enumerate(inside) if mask.any()]
     if not views:
@@ -288,10 +288,10 @@ def albedo_figures(
 def normal_figures(
     folder: MethodFolder, scene: SuiteScene, given: np.ndarray, truth: np.ndarray, inside: np.ndarray
 ) -> dict[str, float]:
-    """Angular errors of world normals (K, H, W, 3) where the foreground has a true one, degrees.
+    """Angular errors of world normals (K, H, W, 3) where the foreground has a true normal, degrees.
 
-    Angles are the same in the world and in a camera's frame, once both are in one. Normals that fit far
-    better in a frame that the method does not name are a fault: the figure would be of the mistake.
+    Angles do not depend on the frame once both normals are in one frame. Normals that fit far better in a
+    frame other than the method's declared one are a fault: the figure would measure that mistake.
     """
     where = inside & truth.any(axis=-1)
     if not where.any():
@@ -308,13 +308,13 @@ def normal_figures(
 
 
 def identical_share(suite: Suite, found: Judged, folder: Path) -> float | None:
-    """Share of its figures that a method keeps as somebody else: pictures of a scene, as seen, judged anew.
+    """Share of a method's figures that stay when its display pictures of a scene are judged again as display.
 
     Args:
-        folder: an empty one, for the other's pictures.
+        folder: empty folder for the other method's pictures.
 
     Returns:
-        That of figures within TOLERANCE, HDR-FLIP left out; None where no scene has figures.
+        Share of figures within TOLERANCE, without HDR-FLIP; None if no scene has figures.
     """
     scene = next((each for name, each in suite.scenes.items() if name in found.whole), None)
     if scene is None:
@@ -339,6 +339,6 @@ def identical_share(suite: Suite, found: Judged, folder: Path) -> float | None:
 
 
 def common_scenes(judged: Iterable[Judged]) -> set[str]:
-    """Scenes that all methods have figures of."""
+    """Return the scenes in which all methods have figures."""
     found = [each.whole for each in judged]
     return set.intersection(*found) if found else set()

@@ -1,8 +1,8 @@
-"""Benchmark `tron_synth`: the suite of that name made, TRON's ways and a mesh shown on it, and all judged.
+"""Benchmark `tron_synth`: make the suite TRON-Synth, render it by TRON's ways and a mesh, judge all.
 
-What the single commands do (`tron-eval export=`, `method=`, `benchmark=compare`), in one. Two questions have
-rows of their own: what the network gains over the best of the ways without one, on surfels through the true
-surfaces; and what TRON gains from photos alone over the mesh that an engineer would fit to them.
+It runs the commands `tron-eval export=`, `method=` and `benchmark=compare`. Two gains have rows of their own:
+the network over the best way without one, on surfels of the true surfaces; and TRON from photos alone over
+the mesh that an engineer would fit to the photos.
 """
 
 from __future__ import annotations
@@ -35,19 +35,19 @@ class Synthetic(Benchmark):
 
     name: ClassVar[str] = "tron_synth"
 
-    export: list[str] = Field(description="arguments of tron-eval that make the suite")
+    export: list[str] = Field(description="arguments of tron-eval that export the suite")
     methods: dict[Part, list[str]] = Field(description="method -> further arguments of tron-eval method=NAME")
-    compare: Compare = Field(description="settings of the comparison; suite and methods are filled in")
+    compare: Compare = Field(description="settings of benchmark=compare; suite and methods are filled in")
 
     def check(self) -> None:
-        """Find what the stages call."""
+        """Find the commands of the stages."""
         require_own_packages("datagen", "tron.reconstruction")
         for script in ("tron-eval", "tron-datagen", "tron-reconstruct"):
             script_path(script)
         require("oidn", "benchmark=tron_synth")  # of the mesh, and a way
 
     def run(self, output_dir: Path) -> Outcome:
-        """Run the stages that are not finished; judge anew.
+        """Run the unfinished stages, then judge again.
 
         Raises:
             StageFailed: a command failed; what was finished before it is kept and is not redone.
@@ -83,7 +83,7 @@ class Synthetic(Benchmark):
 
 
 def gains(rows: Mapping[str, Row]) -> Iterator[Row]:
-    """The two questions' rows, from those of the comparison; none where a method is not there."""
+    """Yield rows of the two gains from rows of the comparison; no row if a method is absent."""
     ours = [name.removesuffix(".faults") for name in rows if name.endswith(".faults")]
     others = [name for name in ours if name.startswith(WITHOUT) and name != NETWORK]
     # A method with a fault has no mean, and no best is sought among those that happen to have one.
@@ -98,7 +98,7 @@ def gains(rows: Mapping[str, Row]) -> Iterator[Row]:
 
 
 def _gain(rows: Mapping[str, Row], ours: str, other: str, metric: str) -> Row:
-    """Of the comparison, which names the better of two first."""
+    """Return a gain from the comparison, whose rows name the better of two methods first."""
     row, turned = rows.get(f"{ours}.gain_over_{other}"), False
     if row is None:
         row, turned = rows[f"{other}.gain_over_{ours}"], True

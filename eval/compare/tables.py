@@ -1,4 +1,4 @@
-"""Tables of a comparison as files: CSV of every picture, scene and pair, and LaTeX of the whole."""
+"""Write tables of a comparison: CSV of every picture, scene and pair, and a LaTeX table of methods."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ def write_tables(folder: Path, judged: Sequence[Judged], rows: Mapping[str, Row]
     Args:
         folder: that exists.
         judged: every method.
-        rows: by their metrics; means and their intervals are taken from them.
+        rows: metric -> row, the source of means and intervals.
     """
     names = list(dict.fromkeys(name for each in judged for score in each.frames for name in score.figures))
     _csv(
@@ -59,7 +59,7 @@ def write_tables(folder: Path, judged: Sequence[Judged], rows: Mapping[str, Row]
 
 
 def latex(judged: Sequence[Judged], measures: Sequence[Measure], rows: Mapping[str, Row]) -> str:
-    """A table for booktabs: a method a line, the best of each column bold, a dash where a scene failed."""
+    """Return a booktabs table: one line per method, best of a column bold, a dash where a scene failed."""
     cells = {each.name: [rows.get(f"{each.name}.{m.name}") for m in measures] for each in judged}
     best = []
     for column, measure in enumerate(measures):
@@ -83,7 +83,7 @@ def _bold(text: str, best: bool) -> str:
 
 
 def _scene_lines(judged: Judged, names: Sequence[str], maps: Sequence[str]) -> Iterable[list[object]]:
-    """A line for each scene and light, means over frames; one more, without a light, for the scene's maps."""
+    """Yield a line of means over frames for each scene and light, and a line without light for maps."""
     groups: dict[tuple[str, str], list[Mapping[str, float]]] = {}
     for score in judged.frames:
         groups.setdefault((score.scene, score.light), []).append(score.figures)

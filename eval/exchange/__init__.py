@@ -1,1 +1,1 @@
-"""Benchmark `exchange`: files that we write as other programs read them, and the reverse."""
+"""Benchmark `exchange`: other programs read our files, and we read theirs."""

@@ -1,4 +1,4 @@
-"""Benchmark `exchange`: scenes as files of other programs, each read by a program that is not ours."""
+"""Benchmark `exchange`: scenes in formats of other programs, each read by another program."""
 
 from __future__ import annotations
 
@@ -19,44 +19,48 @@ Part = Literal["splats", "mesh", "models", "viewer"]
 
 
 class Exchange(Benchmark):
-    """Parts, sizes, and where the other programs are."""
+    """Settings: parts, sizes, and paths of the other programs."""
 
     name: ClassVar[str] = "exchange"
 
-    parts: list[Part] = Field(description="what is measured", min_length=1)
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
     seed: int = 0
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
-    threads: PositiveInt | None = Field(default=None, description="of Dr.Jit and of Cycles; null: one a core")
+    threads: PositiveInt | None = Field(
+        default=None, description="Cycles and Dr.Jit threads; null: one a core"
+    )
     splat_transform: Path | None = Field(
         default=None, description="PlayCanvas's splat-transform; null: the one on PATH, if any"
     )
     blender_python: Path | None = Field(
         default=None,
-        description="a Python that has bpy, of an environment of its own; null: no mesh, no models",
+        description="Python with bpy, in an environment of its own; null: no mesh, no models",
     )
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no mesh, no models")
-    worlds: PositiveInt = Field(default=3, description="scenes of splats, each under another kind of light")
-    surfels: PositiveInt = Field(default=20_000, description="of each scene of splats, about")
-    mesh_surfels: PositiveInt = Field(default=60_000, description="of the model that becomes a mesh, about")
-    views: PositiveInt = Field(default=3, description="of the mesh")
-    width: PositiveInt = Field(default=256, description="of the square views of the mesh")
-    paths: PositiveInt = Field(default=144, description="of a pixel of the mesh, by Cycles and by Mitsuba")
-    model_paths: PositiveInt = Field(default=1024, description="of a pixel of a model, by either")
-    texture: int = Field(default=2048, ge=64, le=8192, description="pixels of a side of the mesh's textures")
+    real_data: Path | None = Field(
+        default=None, description="folder with assets, hdri; null: no mesh, models"
+    )
+    worlds: PositiveInt = Field(default=3, description="number of splat scenes, each under another light")
+    surfels: PositiveInt = Field(default=20_000, description="approximate number of surfels of a splat scene")
+    mesh_surfels: PositiveInt = Field(default=60_000, description="approximate surfels of the exported model")
+    views: PositiveInt = Field(default=3, description="number of views of the mesh")
+    width: PositiveInt = Field(default=256, description="width of the square views of the mesh")
+    paths: PositiveInt = Field(default=144, description="samples per pixel of the mesh, Cycles and Mitsuba")
+    model_paths: PositiveInt = Field(default=1024, description="samples per pixel of a model, each renderer")
+    texture: int = Field(default=2048, ge=64, le=8192, description="width of the mesh's textures")
     scans: list[Path] | None = Field(
-        default=None, description="plain 3DGS PLYs that viewers show; null: those of real_data/splats"
+        default=None, description="plain 3DGS PLYs to view; null: all in real_data/splats"
     )
-    scan_views: int = Field(default=8, ge=2, description="of each scan")
+    scan_views: int = Field(default=8, ge=2, description="number of views of each scan")
     scan_sides: list[PositiveInt] = Field(
-        default=[384, 512, 1024], min_length=1, description="of these views"
+        default=[384, 512, 1024], min_length=1, description="widths of these square views"
     )
     playcanvas: Path | None = Field(
         default=None,
-        description="node_modules/playcanvas, the npm package; null: no picture of a real viewer",
+        description="npm package node_modules/playcanvas; null: no comparison with a real viewer",
     )
 
     def check(self) -> None:
-        """Find the programs that are given."""
+        """Find the given programs."""
         from eval.exchange.readers import find_splat_transform, splat_transform_version
         from eval.renderers.blender import blender_version
 
@@ -97,11 +101,11 @@ class Exchange(Benchmark):
             )  # fmt: skip
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each figure.
+        """Measure part by part; write one line per figure to stderr.
 
         Raises:
             StageFailed: tron-export failed.
-            TronError: a program that is given is not there, or Blender cannot read the mesh.
+            TronError: a given program does not exist, or Blender cannot read the mesh.
         """
         # The renderer: not for a mistyped key
         from eval.exchange.mesh import Sizes, measure_mesh

@@ -1,11 +1,11 @@
-"""A real model as surfels, exported as a mesh with textures, and read back by Blender.
+"""Turn a real model into surfels, export them as a textured mesh, and read the mesh by Blender.
 
 The model is turned into surfels (:func:`tron.models.surfels.surfels_of_model`), which have neither its
 triangles nor its textures, and ``tron-export`` makes a .glb of them. Blender reads it, and Cycles shows its
 base color and its normals, which are held against the model's own at the same pixels, and renders it under
 photographed lights. Ours is ``lit`` of the surfels; Mitsuba's path tracer sees the model itself.
 
-Pixels count that the model fills: what the mesh lacks there is black, and its normal 90 degrees wrong.
+Only pixels that the model fills count: holes of the mesh are black there, with a normal error of 90 degrees.
 """
 
 from __future__ import annotations
@@ -52,13 +52,13 @@ FILLED = 0.995
 
 @dataclass(frozen=True)
 class Sizes:
-    """How much is done.
+    """Numbers of surfels, views, samples and texels.
 
     Attributes:
-        surfels: of the model, about.
-        views, side: cameras around it, and pixels of their sides.
-        paths: of a pixel, by Cycles and by Mitsuba.
-        texture: texels of a side.
+        surfels: approximate number of surfels of the model.
+        views, side: number of cameras around the model, and their width in pixels.
+        paths: samples per pixel, by Cycles and by Mitsuba.
+        texture: width of the textures in texels.
     """
 
     surfels: int
@@ -69,9 +69,9 @@ class Sizes:
 
 
 class Truth(NamedTuple):
-    """The model at a view's pixels: base color (linear) and normal (H, W, 3) as means of rays, and opacity.
+    """Maps of the model in a view: base color (linear) and normal (H, W, 3) as means of rays, and opacity.
 
-    ``smooth`` are the normals without normal maps, of which surfels know nothing.
+    ``smooth`` holds normals without normal maps, which surfels do not have.
     """
 
     base_color: np.ndarray
@@ -82,7 +82,7 @@ class Truth(NamedTuple):
 
 @dataclass(frozen=True, eq=False)
 class View:
-    """A view of the mesh under one light beside ours and the truth.
+    """A view under one light: the mesh, the surfels and the truth.
 
     Attributes:
         light: its name. exposure: of its pictures.
@@ -100,11 +100,11 @@ class View:
 
     @property
     def filled(self) -> np.ndarray:
-        """(H, W) bool, pixels that count."""
+        """(H, W) bool: pixels that the model fills."""
         return self.truth.opacity > FILLED
 
     def psnr(self, image: np.ndarray, other: np.ndarray) -> float:
-        """dB of display values."""
+        """PSNR of display values, dB."""
         shown = [to_display(each, self.exposure) for each in (image, other)]
         return capped_psnr(shown[0], shown[1], self.filled)
 
@@ -113,12 +113,12 @@ def measure_mesh(
     real_data: Path | None, python: Path | None, sizes: Sizes, seed: int, threads: int,
     outcome: Outcome, stages: Stages,
 ) -> None:  # fmt: skip
-    """Figures of the exported mesh, and pictures.
+    """Measure the exported mesh, and show pictures.
 
     Args:
         real_data: folder with ``assets`` and ``hdri``; None: nothing is measured.
-        python: that has Blender; None: nothing is measured.
-        sizes: how much is done.
+        python: Python with Blender; None: nothing is measured.
+        sizes: numbers of surfels, views, samples and texels.
         seed: root of all random numbers.
         threads: of Cycles.
         outcome: takes rows, pictures, and what could not be measured.
@@ -167,7 +167,7 @@ def measure_mesh(
 
 
 def mesh_rows(views: Sequence[View]) -> Iterator[Row]:
-    """Means over views; maps are the same under every light, and count once."""
+    """Yield means over views; maps do not depend on the light and count once."""
     once = [view for view in views if view.light == views[0].light]
     base = [capped_psnr(v.seen.base_color, v.truth.base_color, v.filled) for v in once]
     normal, smooth = (
@@ -189,7 +189,7 @@ def mesh_rows(views: Sequence[View]) -> Iterator[Row]:
 
 
 def true_maps(shapes: Sequence[Shape], camera: Camera) -> Truth:
-    """What rays through sub-pixels meet of a model."""
+    """Trace the model's true maps by rays through sub-pixels."""
     fine = camera.resized(FINENESS * camera.width, FINENESS * camera.height)
     along = lanes(mi.Vector3f, fine.rays().reshape(-1, 3))
     ray = mi.Ray3f(mi.Point3f(*camera.position.tolist()), along)
@@ -212,7 +212,7 @@ def _views(
     real_data: Path, python: Path, model: Path, scene: GaussianScene, shapes: Sequence[Shape],
     cameras: list[Camera], sizes: Sizes, seed: int, threads: int,
 ) -> list[View]:  # fmt: skip
-    """Every view under every light."""
+    """Render every view under every light."""
     lights = [EnvironmentMap.load(light_file(real_data, name), turn) for name, turn in LIGHTS]
     seen = rendered(
         python, model, cameras, lights, model.parent, samples=sizes.paths, bounces=FINEST.bounces,
@@ -234,7 +234,7 @@ def _views(
 
 
 def light_file(real_data: Path, name: str) -> Path:
-    """The map of a light."""
+    """Return the path of a light's map."""
     return real_data / "hdri" / f"{name}.hdr"
 
 

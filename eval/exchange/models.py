@@ -1,6 +1,6 @@
-"""Models of glTF path-traced twice, by Mitsuba with our material and by Cycles as Blender reads the file.
+"""Path-trace glTF models by Mitsuba with our material, and by Cycles with Blender's importer.
 
-Nothing of ours but the reader of models and the material (:mod:`tron.brdf`) is judged: no surfel, no ``lit``.
+Only our model reader and our material (:mod:`tron.brdf`) are judged, not surfels and not ``lit``.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ SIDE = 96
 
 @dataclass(frozen=True, eq=False)
 class Pair:
-    """A model under a light, by both.
+    """A model under a light, by both renderers.
 
     Attributes:
         model, light: their names.
@@ -54,25 +54,25 @@ class Pair:
 
     @property
     def psnr(self) -> float:
-        """dB of display values."""
+        """PSNR of display values, dB."""
         shown = [to_display(each, self.exposure) for each in (self.mitsuba, self.cycles)]
         return capped_psnr(shown[0], shown[1], self.filled)
 
     @property
     def ratio(self) -> float:
-        """Mean of Mitsuba's over that of Cycles'."""
+        """Mean of Mitsuba's picture over the mean of Cycles' picture."""
         return float(self.mitsuba[self.filled].mean() / self.cycles[self.filled].mean())
 
 
 def measure_models(
     real_data: Path | None, python: Path | None, paths: int, seed: int, threads: int, outcome: Outcome
 ) -> None:
-    """Figures of every model under every light, and pictures.
+    """Measure every model under every light, and show pictures.
 
     Args:
         real_data: folder with ``assets`` and ``hdri``; None: nothing is measured.
-        python: that has Blender; None: nothing is measured.
-        paths: of a pixel, by either.
+        python: Python with Blender; None: nothing is measured.
+        paths: samples per pixel, by either renderer.
         seed: root of all random numbers.
         threads: of Cycles.
         outcome: takes rows, pictures, and what could not be measured.
@@ -103,14 +103,14 @@ def both(
     python: Path, file: Path, lights: Mapping[str, EnvironmentMap], folder: Path, paths: int, seed: int,
     threads: int, side: int = SIDE,
 ) -> list[Pair]:  # fmt: skip
-    """A model under lights, by both renderers.
+    """Render a model under lights by both renderers.
 
     Args:
-        python: that has Blender.
-        file: of the model.
+        python: Python with Blender.
+        file: file of the model.
         lights: by their names.
         folder: for Blender's job and its frames.
-        paths: of a pixel.
+        paths: samples per pixel.
         seed: root of all random numbers.
         threads: of Cycles.
         side: of the square pictures, pixels.
@@ -131,7 +131,7 @@ def both(
 
 
 def before(parts: Sequence[Part], side: int) -> Camera:
-    """A camera that a model fills, from its front and right, a little above it."""
+    """Return a camera whose picture the model fills, from its front and right, a little above it."""
     corners = outline(parts).vertices
     middle = (corners.min(0) + corners.max(0)) / 2
     radius = float(np.linalg.norm(corners - middle, axis=1).max())
@@ -140,7 +140,7 @@ def before(parts: Sequence[Part], side: int) -> Camera:
 
 
 def model_rows(pairs: Sequence[Pair]) -> Iterator[Row]:
-    """Each pair's, their mean and their worst."""
+    """Yield rows of each pair, of their mean and of the worst."""
     for pair in pairs:
         case = f"{pair.model}_{pair.light}".replace("-", "_").lower()
         yield Row(metric=f"blender.psnr.{case}", value=pair.psnr, unit="dB", n=1)

@@ -1,4 +1,4 @@
-"""PlayCanvas' engine in headless Chromium: what a viewer of splats that people use shows of a PLY.
+"""PlayCanvas' engine in headless Chromium: pictures of a PLY by a widely used splat viewer.
 
 It draws on the processor (SwiftShader). Its splats are thinner than 3DGS's. It adds 0.3 to covariances that
 it takes in half pixels, ``NARROW`` square pixels, and cuts the kernel at sqrt(8) deviations, shifted so that
@@ -71,7 +71,7 @@ app.start();
 
 
 def lacking(engine: Path | None) -> str | None:
-    """Why the engine cannot draw here; None where it can."""
+    """Return why the engine cannot draw here; None if it can."""
     if engine is None or not (engine / "build" / "playcanvas.mjs").is_file():
         return f"PlayCanvas' engine is not there: {INSTALL}"
     if importlib.util.find_spec("playwright") is None:
@@ -80,7 +80,7 @@ def lacking(engine: Path | None) -> str | None:
 
 
 def shown(engine: Path, scan: Path, cameras: Sequence[Camera]) -> Iterator[np.ndarray]:
-    """(H, W, 3) display values over black of each camera, whose image is square and about its axis.
+    """Render display values (H, W, 3) over black for cameras with square images about their axes.
 
     Args:
         engine: the npm package, of which ``build/playcanvas.mjs`` is served.
@@ -133,7 +133,7 @@ class _Quiet(SimpleHTTPRequestHandler):
 
 @contextmanager
 def _served(folder: Path) -> Iterator[str]:
-    """Address at which this machine alone reads a folder."""
+    """Serve a folder on an address that only this machine reaches."""
     server = ThreadingHTTPServer(("127.0.0.1", 0), partial(_Quiet, directory=str(folder)))
     thread = Thread(target=server.serve_forever, daemon=True)
     thread.start()

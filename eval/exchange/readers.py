@@ -1,7 +1,7 @@
-"""Readers that share no code with TRON's: each makes a plain 3DGS PLY of a file of splats.
+"""Independent readers of splat files: each converts a file into a plain 3DGS PLY.
 
-PlayCanvas's splat-transform (npm) converts by itself. usd-core and trimesh hand out what a USD or a glTF
-holds, and the PLY is laid out here by what 3DGS's own reader asks for (Kerbl et al. 2023).
+They share no code with TRON. PlayCanvas's splat-transform (npm) converts by itself; usd-core and trimesh read
+a USD or a glTF, and the PLY is written here as 3DGS's own reader needs it (Kerbl et al. 2023).
 """
 
 # usd-core has no types.
@@ -31,10 +31,10 @@ _HARMONICS = [f"SH_DEGREE_{degree}_COEF_{n}" for degree in range(4) for n in ran
 
 
 def find_splat_transform(given: Path | None) -> Path | None:
-    """The program: the one given, or that on PATH; None where there is none.
+    """Return the given program, or the one on PATH; None if there is none.
 
     Raises:
-        TronError: the one given is not there.
+        TronError: the given program does not exist.
     """
     if given is None:
         found = shutil.which("splat-transform")
@@ -45,10 +45,10 @@ def find_splat_transform(given: Path | None) -> Path | None:
 
 
 def splat_transform(program: Path, source: Path, target: Path) -> None:
-    """Convert a file by splat-transform, which knows both formats by their names.
+    """Convert a file by splat-transform, which recognises both formats by their suffixes.
 
     Raises:
-        TronError: it fails, with its last words.
+        TronError: it fails; the error has its last output.
     """
     words = [str(program), "-w", "-q", "-g", "cpu", str(source), str(target)]
     try:
@@ -63,7 +63,7 @@ def splat_transform(program: Path, source: Path, target: Path) -> None:
 
 
 def splat_transform_version(program: Path) -> str:
-    """What the program says of itself.
+    """Return the version that the program prints.
 
     Raises:
         TronError: it cannot be run.
@@ -79,7 +79,7 @@ def splat_transform_version(program: Path) -> str:
 
 
 def usd_core(source: Path, target: Path) -> None:
-    """A PLY of the one prim of splats of a USD, by the schema's own accessors.
+    """Convert the only splat prim of a USD into a PLY, by the schema's own accessors.
 
     Raises:
         TronError: usd-core is not installed, or the stage has no such prim.
@@ -110,16 +110,16 @@ _CAUGHT: list[dict[str, np.ndarray]] = []
 
 @register_handler(EXTENSION, scope="primitive_preprocess")
 def _catch(context: Mapping[str, Any]) -> None:
-    """trimesh's way to extensions that it does not know: a primitive with its accessors, decoded."""
+    """Receive a primitive and its decoded accessors from trimesh's hook for unknown extensions."""
     attributes = context["primitive"]["attributes"]
     _CAUGHT.append({name: np.array(context["accessors"][k]) for name, k in attributes.items()})
 
 
 def trimesh_gltf(source: Path, target: Path) -> None:
-    """A PLY of the one primitive of splats of a glTF, by trimesh's accessors.
+    """Convert the only splat primitive of a glTF into a PLY, by trimesh's accessors.
 
     Raises:
-        TronError: it has none, or several.
+        TronError: the file has no splat primitive, or several.
     """
     _CAUGHT.clear()
     trimesh.load_scene(source)

@@ -1,11 +1,11 @@
-"""Splats in every format: written by us and read by another program, drawn by one tracer.
+"""Splats in every format: we write them, another program reads them, one tracer draws both.
 
-Worlds of surfels under a light that is baked into their harmonics, so that colours change with the view.
-Files hold kernels of degree 2: what that change costs is a figure of its own (``format.degree2.psnr``), and
-every format is held against the degree 2 that went into it. No file of splats says which side a surfel shows,
-so that both are drawn as seen from both; what that costs is a figure too (``format.both_sides.psnr``). Files
-that splat-transform writes and we read are held against the same. ``scene_psnr`` is against the scene itself:
-all of the losses together. Pixels count that surfels cover, before or after.
+Scenes are surfels with baked light in their harmonics, so colours change with the view.
+Files hold kernels of degree 2; ``format.degree2.psnr`` is the loss by this change, and every format is
+compared with the degree-2 scene that went into it. Splat files do not say which side a surfel shows, so both
+sides are drawn; ``format.both_sides.psnr`` is the loss. Files that splat-transform writes and we read have
+the same reference. ``scene_psnr`` compares with the scene itself: all losses together. Only pixels that
+surfels cover before or after count.
 """
 
 from __future__ import annotations
@@ -65,12 +65,12 @@ Convert = Callable[[Path, Path], None]
 
 
 class Reader(NamedTuple):
-    """A program that is not ours.
+    """Another program that reads splats.
 
     Attributes:
         name: for people.
-        convert: makes a plain 3DGS PLY of a file; None where the program is not there.
-        why: it is not.
+        convert: converts a file into a plain 3DGS PLY; None if the program is missing.
+        why: reason why it is missing.
     """
 
     name: str
@@ -79,13 +79,13 @@ class Reader(NamedTuple):
 
 
 class Exchanged(NamedTuple):
-    """A format, in the order of the page.
+    """A format of splat files.
 
     Attributes:
-        name: in rows.
-        suffix: of its files.
-        reader: of :func:`find_readers`, which reads what we write, or writes what we read.
-        stands: whether files are y up, as glTF and USD are.
+        name: name in rows.
+        suffix: suffix of its files.
+        reader: key of :func:`find_readers`; that program reads our files, or writes files for us.
+        stands: whether files are y up, such as glTF and USD.
         ours: whether we write it.
     """
 
@@ -110,7 +110,7 @@ FORMATS = (
 
 
 def find_readers(splat_transform: Path | None) -> dict[str, Reader]:
-    """Name -> program; ``splat_transform``: where it is, None: nowhere."""
+    """Return name -> program; ``splat_transform`` is its path, None if it is missing."""
     usd = Reader("usd-core", readers.usd_core)
     if importlib.util.find_spec("pxr") is None:
         usd = Reader("usd-core", None, "usd-core is not installed: pip install 'tron-relight[usd]'")
@@ -126,12 +126,12 @@ def find_readers(splat_transform: Path | None) -> dict[str, Reader]:
 
 @dataclass(frozen=True, eq=False)
 class Baked:
-    """A world whose light is in its harmonics.
+    """A world with its light baked into harmonics.
 
     Attributes:
         name: of the world.
         scene: surfels with kernels of degree 4, z up.
-        plain: the same with kernels of degree 2, and without a sign of normals, as files have them.
+        plain: the surfels with kernels of degree 2 and without signs of normals, as in files.
         cameras: that look at it.
     """
 
@@ -142,7 +142,7 @@ class Baked:
 
     @classmethod
     def drawn(cls, number: int, surfels: int, seed: int) -> Baked:
-        """World ``number`` of a seed, of about so many surfels, under one light of :data:`LIGHTS`."""
+        """Draw world ``number`` of a seed, with about so many surfels, under one light of :data:`LIGHTS`."""
         kind = list(LIGHTS)[number % len(LIGHTS)]
         world = draw_world(seed, "exchange", number, kind, THINGS)
         relighter = Relighter(
@@ -159,7 +159,7 @@ class Baked:
         )
 
     def standing(self) -> Baked:
-        """The world in the frame of files that are y up: splats of one height are sorted otherwise there."""
+        """Return the world in the frame of y-up files, which sort splats of equal depth in another order."""
         turn = Y_UP @ upright(self.scene.up)
         scene, plain = self.scene.rotated(turn), self.plain.rotated(turn)
         return Baked(self.name, scene, plain, turn_cameras(self.cameras, turn))
@@ -173,9 +173,9 @@ class Drawn(NamedTuple):
 
 
 def draw(scene: GaussianScene, cameras: Sequence[Camera]) -> list[Drawn]:
-    """A scene's harmonics by TRON's tracer, means of sub-pixels.
+    """Render a scene's harmonics by TRON's tracer, as means over sub-pixels.
 
-    Where the sign of normals means nothing, all surfels are turned to each camera, as commands do it.
+    If signs of normals have no meaning, all surfels are turned to each camera, as commands do.
     """
     tracer, found = SurfelTracer(scene), []
     for camera in cameras:
@@ -188,7 +188,7 @@ def draw(scene: GaussianScene, cameras: Sequence[Camera]) -> list[Drawn]:
 
 
 def alike(found: Sequence[Drawn], wanted: Sequence[Drawn]) -> list[float]:
-    """PSNR in dB, capped, of each view where either covers a pixel."""
+    """Return the capped PSNR in dB of each view, over pixels that either one covers."""
     return [
         capped_psnr(a.image, b.image, np.maximum(a.opacity, b.opacity) > COVERED)
         for a, b in zip(found, wanted, strict=True)
@@ -197,16 +197,16 @@ def alike(found: Sequence[Drawn], wanted: Sequence[Drawn]) -> list[float]:
 
 @dataclass
 class Trip:
-    """What a format made of one world.
+    """One world's round trip through a format.
 
     Attributes:
-        world: its name.
-        size: of the file, bytes.
-        write, read: seconds of ours; None where another program does it.
-        psnr: dB of each view, against what went into the file.
-        scene_psnr: the same against the scene, its kernels of degree 4 and the signs of its normals.
+        world: name of the world.
+        size: size of the file, bytes.
+        write, read: seconds of our writer and reader; None if another program does it.
+        psnr: dB of each view, against the scene that went into the file.
+        scene_psnr: dB against the original scene with kernels of degree 4 and signed normals.
         views: the first one as it came back, and as it was.
-        equal: share of the PLY's values that came back bit by bit; None of other formats.
+        equal: share of the PLY's values that came back bit by bit; None for other formats.
     """
 
     world: str
@@ -228,19 +228,19 @@ def exchange(
     own: Sequence[Drawn],
     folder: Path,
 ) -> Trip:
-    """Take a scene through a file of a format and a program that is not ours.
+    """Take a scene through a file of a format and another program.
 
     Args:
         each: the format.
-        convert: of its reader.
-        scene: what is written.
+        convert: ``convert`` of the format's reader.
+        scene: scene to write.
         seen: the same world in the frame of the file.
         plain: its views with kernels of degree 2.
         own: its views as it is.
         folder: for the files.
 
     Raises:
-        TronError: the file cannot be written or read, by us or by the other.
+        TronError: the file cannot be written or read, by us or by the other program.
     """
     file, other = folder / f"{each.name}{each.suffix}", folder / f"{each.name}_read.ply"
     write = read = equal = None
@@ -264,7 +264,7 @@ def exchange(
 
 
 def equal_share(file: Path, other: Path) -> float:
-    """Share of a PLY's values that another PLY has bit by bit, in the same rows."""
+    """Return the share of a PLY's values that equal another PLY's bit by bit, in the same rows."""
     first, second = (plyfile.PlyData.read(str(each))["vertex"].data for each in (file, other))
     names = [name for name in first.dtype.names if name not in ("nx", "ny", "nz")]
     if len(first) != len(second) or not set(names) <= set(second.dtype.names):
@@ -275,7 +275,7 @@ def equal_share(file: Path, other: Path) -> float:
 
 @dataclass
 class Splats:
-    """What was found of all worlds.
+    """Figures of all worlds.
 
     Attributes:
         trips: format -> a trip for each world.
@@ -293,7 +293,7 @@ class Splats:
     lacking: dict[str, str] = field(default_factory=dict)
 
     def rows(self, seed: int) -> Iterator[Row]:
-        """Means over worlds, with intervals drawn by ``seed``."""
+        """Yield means over worlds, with intervals drawn by ``seed``."""
         for name in ("degree2", "both_sides"):
             if found := getattr(self, name):
                 yield mean_row(f"format.{name}.psnr", "dB", _by_world(found), seed)
@@ -324,8 +324,8 @@ def measure_splats(
     """Take every world through every format, and through a rasteriser of 3DGS.
 
     Args:
-        worlds: how many are drawn.
-        surfels: of each, about.
+        worlds: number of worlds to draw.
+        surfels: approximate number of surfels of each.
         seed: root of all random numbers.
         programs: of :func:`find_readers`.
         outcome: takes rows, pictures, and what could not be measured.
@@ -386,7 +386,7 @@ def _measure_world(world: Baked, programs: Mapping[str, Reader], found: Splats, 
 def _pictures(
     own: np.ndarray, shown: Sequence[tuple[str, np.ndarray, np.ndarray, float]]
 ) -> Iterator[Pictures]:
-    """The scene and all that differs from it, and the differences."""
+    """Show the scene, every variant that differs from it, and the differences."""
     differing = [each for each in shown if not np.array_equal(each[1], each[2])]
     pictures = [Picture(own, "the scene", "the scene, kernel of degree 4", strong=True)]
     changes = []

@@ -1,8 +1,8 @@
-"""Scans under their own look: TRON's picture against what viewers of splats show.
+"""Scans in their original colours: TRON's picture against splat viewers.
 
 The reference is 3DGS's rasterisation in float64 (:mod:`eval.applications.splat_rasteriser`), of real scans
-and of a world whose light is in harmonics of degree 1, 2 and 3. Where PlayCanvas' engine is there, both are
-held against its pictures too. Display values over black count where the rasteriser or TRON covers a pixel.
+and of a world whose light is in harmonics of degree 1, 2 and 3. If PlayCanvas' engine is installed, both are
+compared with its pictures too. Display values over black count where the rasteriser or TRON covers a pixel.
 """
 
 from __future__ import annotations
@@ -36,13 +36,13 @@ _SOLID = 0.5
 
 @dataclass
 class Viewed:
-    """What was found: pairs of a scan's name and a view's dB.
+    """Figures: pairs of a scan's name and a view's dB.
 
     Attributes:
-        own, disks: TRON's pictures against the rasteriser's; seen as disks in space.
-        engine, engine_rasteriser: both against PlayCanvas' engine.
-        engine_narrow: the rasteriser with the engine's filter against it.
-        harmonics: as own, of the world by the degree.
+        own, disks: TRON against the rasteriser, by projected splats and by disks in space.
+        engine, engine_rasteriser: TRON and the rasteriser against PlayCanvas' engine.
+        engine_narrow: the rasteriser with the engine's filter against the engine.
+        harmonics: as ``own``, of the drawn world with harmonics of each degree.
     """
 
     own: list[tuple[str, float]] = field(default_factory=list)
@@ -53,7 +53,7 @@ class Viewed:
     harmonics: list[tuple[str, float]] = field(default_factory=list)
 
     def rows(self, seed: int) -> Iterator[Row]:
-        """``viewer.*``; ``seed`` of the intervals."""
+        """Yield rows ``viewer.*``; ``seed`` draws the intervals."""
         every = [*self.own, *self.harmonics]
         if self.own:
             yield mean_row("viewer.psnr", "dB", self.own, seed)
@@ -82,11 +82,11 @@ def measure_viewer(
     seed: int,
     outcome: Outcome,
 ) -> None:
-    """Draw scans as TRON does and as viewers do.
+    """Draw scans by TRON and by viewers, and compare.
 
     Args:
         scans: plain PLYs of 3DGS.
-        world: whose harmonics are written up to each degree, and drawn by its own cameras.
+        world: written with harmonics up to each degree, and drawn from its own cameras.
         views: of each scan, around it. sides: pixels of the square pictures.
         engine: PlayCanvas' package, which draws the first and the last view at the first side; None: none.
         folder: for files in between.
@@ -148,7 +148,7 @@ def _around(scene: GaussianScene, views: int, side: int) -> list[Camera]:
 
 
 def _own(scene: GaussianScene, camera: Camera) -> Drawn:
-    """As every camera of TRON sees a scan."""
+    """Render a scan in its own colours, as TRON's cameras do."""
     view = Relighter(scene, proxy="never").gbuffer(camera)
     images = view.images({"rgb": view.rgb, "opacity": view.opacity})
     return Drawn(*_clipped(images["rgb"], images["opacity"]))

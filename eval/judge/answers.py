@@ -1,4 +1,4 @@
-"""Stored answers: JSON lines, one an answer, appended as they come; what was answered is not asked again."""
+"""Stored answers, one JSON line each, appended as they arrive; answered questions are not asked again."""
 
 from __future__ import annotations
 
@@ -20,11 +20,11 @@ LONGEST_LINE = 2**16
 
 
 class Stored(BaseModel):
-    """One line. ``answer`` is null where the judge said none of A, B and TIE as often as it was asked."""
+    """One line. ``answer`` is null if no reply of the judge was A, B or TIE."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    key: str = Field(pattern=r"^[0-9a-f]{64}$", description="of prompt, model, seed and both pictures")
+    key: str = Field(pattern=r"^[0-9a-f]{64}$", description="hash of prompt, model, seed and both pictures")
     scene: str
     light: str
     view: int
@@ -32,12 +32,12 @@ class Stored(BaseModel):
     first: str
     second: str
     answer: Answer | None
-    text: str = Field(description="the reply, cut")
+    text: str = Field(description="the reply, shortened")
     model: str
 
 
 def answer_key(model: str, question: Question, first: bytes, second: bytes) -> str:
-    """Hash of all that a judge is told: with other pictures or another prompt it is another question."""
+    """Hash everything that the judge is sent: other pictures or another prompt make another question."""
     digest = hashlib.sha256()
     for part in (PROMPT.encode(), model.encode(), str(question.seed).encode(), first, second):
         digest.update(hashlib.sha256(part).digest())
@@ -45,7 +45,7 @@ def answer_key(model: str, question: Question, first: bytes, second: bytes) -> s
 
 
 class Answers:
-    """Answers of a file by their keys; ``with answers.appending():`` keeps new ones in it."""
+    """Answers of a file by their keys; ``with answers.appending():`` appends new ones to it."""
 
     def __init__(self, path: Path):
         self.path = path
@@ -55,33 +55,33 @@ class Answers:
         return len(self._found)
 
     def get(self, key: str) -> Stored | None:
-        """The answer to a question, None where it was not asked."""
+        """Return the answer to a question, None if it was not asked."""
         return self._found.get(key)
 
     @contextmanager
     def appending(self) -> Iterator[None]:
-        """Keep answers in the file while the block runs; a line that was cut off is cut away first."""
+        """Append answers to the file while the block runs; an incomplete last line is removed first."""
         self.path.parent.mkdir(parents=True, exist_ok=True)
         with open(self.path, "ab+") as self._file:
             _end_whole(self.path)
             yield
 
     def add(self, stored: Stored) -> None:
-        """Keep an answer, on disk at once."""
+        """Keep an answer, and write it to disk at once."""
         self._file.write((stored.model_dump_json() + "\n").encode())
         self._file.flush()
         self._found[stored.key] = stored
 
 
 def _end_whole(path: Path) -> None:
-    """Cut away a last line without an end: a process was killed while it wrote."""
+    """Remove a last line without a line end, left by a process that was killed while writing."""
     with open(path, "rb+") as file:
         content = file.read()
         file.truncate(content.rfind(b"\n") + 1)
 
 
 def _read(path: Path) -> Iterator[Stored]:
-    """Whole lines of a file; TronError names one that is no answer."""
+    """Read the complete lines of a file; TronError names a line that is no answer."""
     with open(path, "rb") as file:
         for number, line in enumerate(iter(lambda: file.readline(LONGEST_LINE), b""), 1):
             if not line.endswith(b"\n"):

@@ -1,4 +1,4 @@
-"""Asking many questions at a time, answers kept as they come."""
+"""Ask many questions in parallel, and store each answer as it arrives."""
 
 from __future__ import annotations
 
@@ -29,7 +29,7 @@ Found = Mapping[Question, Answer | None]
 def replay(
     asked: Iterable[Question], picture: Picture, model: str, answers: Answers
 ) -> dict[Question, Answer | None]:
-    """Stored answers to questions; those that are not stored are left out."""
+    """Return the stored answers to questions; questions without a stored answer are left out."""
     found = {}
     for question in asked:
         stored = answers.get(
@@ -43,11 +43,11 @@ def replay(
 def ask_all(
     asked: Sequence[Question], picture: Picture, endpoint: Endpoint, answers: Answers, parallel: int
 ) -> dict[Question, Answer | None]:
-    """Ask what is not answered yet, ``parallel`` questions at a time, and return all answers.
+    """Ask the unanswered questions, ``parallel`` at a time, and return all answers.
 
     Raises:
-        TronError: the endpoint refuses, or left PATIENCE questions in a row without an answer; what was
-            answered before is kept.
+        TronError: the endpoint refuses, or left PATIENCE questions in a row without an answer; earlier
+            answers are kept.
     """
     with answers.appending():
         return asyncio.run(_ask_all(asked, picture, endpoint, answers, parallel))

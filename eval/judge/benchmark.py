@@ -32,36 +32,38 @@ ANSWERS, SENT = "answers.jsonl", "sent"
 
 
 class Judge(Benchmark):
-    """Methods of a suite judged in pairs, and the judge itself."""
+    """Settings: methods of a suite to judge in pairs, and the judge."""
 
     name: ClassVar[str] = "judge"
 
-    suite: Path | None = Field(description="folder of tron-eval export=SUITE; null: known judges alone")
+    suite: Path | None = Field(
+        description="folder written by tron-eval export=SUITE; null: only judges with known answers"
+    )
     methods: Path | list[Path] | None = Field(description="folder of methods' folders, or [a,b]")
-    ours: str | None = Field(description="name of the method that is held against all others")
+    ours: str | None = Field(description="name of the method to compare with all others")
     judge: Literal["endpoint", "replay"] = Field(
-        description="endpoint: ask the model, and keep its answers; replay: take stored answers alone"
+        description="endpoint: ask the model and store its answers; replay: use stored answers only"
     )
     endpoint: str | None = Field(
         description="address of an OpenAI-compatible API, such as https://api.openai.com/v1; pictures of the "
         "methods are sent there"
     )
-    model: str | None = Field(description="name of a model there that sees pictures")
-    key_variable: str = Field(description="environment variable that holds its key; no file ever does")
+    model: str | None = Field(description="name of a vision model at this address")
+    key_variable: str = Field(description="environment variable with the API key, never written to a file")
     answers: Path | None = Field(
-        description="file of answers, which are not asked for again; null: answers.jsonl in output_dir"
+        description="file of stored answers, which are reused; null: answers.jsonl in output_dir"
     )
-    views: PositiveInt = Field(description="drawn of each scene and light")
+    views: PositiveInt = Field(description="number of views drawn per scene and light")
     seeds: list[int] = Field(
-        description="rounds: each draws its views, and is sent to the judge", min_length=1
+        description="one round per seed; it draws the views and is sent to the judge", min_length=1
     )
-    parallel: PositiveInt = Field(description="questions on their way at a time", le=64)
-    timeout: PositiveFloat = Field(description="seconds that one try may take")
-    retries: NonNegativeInt = Field(description="tries after the first, of no answer or a useless one", le=20)
-    seed: int = Field(default=0, description="draws the control pairs and the order of questions")
+    parallel: PositiveInt = Field(description="number of questions in flight", le=64)
+    timeout: PositiveFloat = Field(description="time limit of one try, seconds")
+    retries: NonNegativeInt = Field(description="further tries after a missing or invalid answer", le=20)
+    seed: int = Field(default=0, description="seed of the control pairs and of the order of questions")
 
     def check(self) -> None:
-        """Look whether all is said that a judge of methods needs, before anything is asked."""
+        """Check that all settings for judging methods are given, before anything is asked."""
         if self.judge == "endpoint" or self.suite is None:
             require_openai()
         if self.suite is None:
@@ -78,11 +80,11 @@ class Judge(Benchmark):
         self._read()
 
     def run(self, output_dir: Path) -> Outcome:
-        """Ask known judges, then the judge about control pairs, and about methods if these are won.
+        """Ask judges with known answers, then the judge about control pairs, then about methods if it is fit.
 
         Raises:
-            TronError: a folder is not what it should be, or the endpoint does not answer; what it answered is
-                kept, and the same command goes on.
+            TronError: a folder is not what it should be, or the endpoint does not answer; its answers are
+                kept, and the same command resumes.
         """
         outcome = Outcome(output_dir)
         if self.judge == "endpoint" or self.suite is None:
@@ -98,7 +100,7 @@ class Judge(Benchmark):
         return outcome
 
     def _read(self) -> tuple[Suite, dict[str, MethodFolder | None]]:
-        """The suite, and methods beside the truth; TronError where ours is not among them, or alone."""
+        """Read the suite, the methods and the truth; TronError if ours is missing, or has no rival."""
         from eval.compare.displayed import methods_and_truth
         from eval.protocol.suite import Suite
 
@@ -184,7 +186,7 @@ class Judge(Benchmark):
 
 
 def _pair(question: Question, sent: Sent, found: Found) -> Pictures:
-    """A pair as the judge saw it, and what it said in both orders."""
+    """Show a pair as the judge saw it, with its answers in both orders."""
     said = [found[question], found[question.swapped()]]
     title = (
         f"{question.scene}, {question.light}, view {question.view}: {said[0]}, in the other order {said[1]}"

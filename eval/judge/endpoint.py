@@ -1,7 +1,7 @@
-"""A vision model behind any OpenAI-compatible endpoint, asked with patience that ends.
+"""Client of a vision model behind an OpenAI-compatible endpoint, with bounded retries.
 
-Chat completions with two PNG pictures, by the package ``openai``, which tries again after time-outs, refused
-connections, 429 and 5xx. Replies are bounded in size and time whatever the other side does.
+It sends chat completions with two PNG pictures by the package ``openai``, which retries after time-outs,
+refused connections, 429 and 5xx. Size and time of replies are always bounded.
 """
 
 from __future__ import annotations
@@ -30,13 +30,13 @@ class NoAnswer(Exception):
 
 @dataclass(frozen=True)
 class Endpoint:
-    """Where the judge is.
+    """Address, model and limits of the judge.
 
     Attributes:
         url: base, such as https://api.openai.com/v1.
-        model: its name there.
-        key_variable: environment variable that holds the key.
-        timeout: seconds that one try may take.
+        model: name of the model.
+        key_variable: environment variable with the API key.
+        timeout: time limit of one try, seconds.
         retries: tries after the first.
     """
 
@@ -47,7 +47,7 @@ class Endpoint:
     retries: int
 
     def check(self) -> None:
-        """Raise TronError where the address is none, holds a password, or ``openai`` is not installed."""
+        """Raise TronError if the address is invalid or has a password, or ``openai`` is not installed."""
         parts = urlsplit(self.url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
             raise TronError(
@@ -61,7 +61,7 @@ class Endpoint:
         require_openai()
 
     def client(self) -> Any:
-        """An ``AsyncOpenAI``, to be closed by ``async with``."""
+        """Return an ``AsyncOpenAI``; close it by ``async with``."""
         logging.getLogger("httpx2").setLevel(logging.WARNING)  # which reports every request
         return require_openai().AsyncOpenAI(
             base_url=self.url,
@@ -71,10 +71,10 @@ class Endpoint:
         )
 
     async def ask(self, client: Any, seed: int, first: bytes, second: bytes) -> tuple[Answer | None, str]:
-        """The answer to two PNG pictures and the reply's text; a reply that is none is asked for again.
+        """Return the answer about two PNG pictures and the reply's text; ask again after an invalid reply.
 
         Raises:
-            TronError: it refuses such questions, whatever the pictures.
+            TronError: the endpoint refuses such questions, whatever the pictures.
             NoAnswer: nothing came in all tries.
         """
         said = ""
@@ -85,7 +85,7 @@ class Endpoint:
         return None, said
 
     async def _reply(self, client: Any, seed: int, first: bytes, second: bytes) -> str:
-        """The text of one reply, whatever it says."""
+        """Return the text of one reply, whatever it says."""
         openai = require_openai()
         content: list[dict[str, Any]] = [{"type": "text", "text": PROMPT}]
         for name, picture in (("A", first), ("B", second)):
@@ -119,13 +119,13 @@ class Endpoint:
         return _text(bytes(body))
 
     def _message(self, error: Any) -> str:
-        """What it says of a refusal, without our key."""
+        """Return the endpoint's message about a refusal, without our key."""
         said = str(getattr(error, "message", ""))[:200]
         return said.replace(os.environ.get(self.key_variable) or NO_KEY, "***")
 
 
 def _text(body: bytes) -> str:
-    """The text of a chat completion; what is none stands for itself, and is no answer."""
+    """Return the text of a chat completion; any other reply is returned as text, and is no answer."""
     try:
         return str(json.loads(body)["choices"][0]["message"]["content"])
     except (ValueError, LookupError, TypeError, RecursionError):
@@ -133,7 +133,7 @@ def _text(body: bytes) -> str:
 
 
 def require_openai() -> Any:
-    """The package ``openai``; TronError where it is not installed."""
+    """Import the package ``openai``; TronError if it is not installed."""
     try:
         return importlib.import_module("openai")
     except ImportError as error:

@@ -1,7 +1,7 @@
-"""Judges whose answers are known, behind an endpoint on this machine: what the benchmark is held to.
+"""Judges with known answers behind an endpoint on this machine, which check the benchmark itself.
 
-One answers by PSNR against the true picture, one always says A. The first must be found fit, and the second
-must be found out.
+One answers by PSNR against the true picture, one always says A. The benchmark
+must find the first one fit and the second one unfit.
 """
 
 from __future__ import annotations
@@ -36,7 +36,7 @@ Judge = Callable[[np.ndarray, np.ndarray], str]
 
 
 class Handler(BaseHTTPRequestHandler):
-    """POST /v1/chat/completions, with two pictures, as OpenAI's servers have it."""
+    """Handler of POST /v1/chat/completions with two pictures, as in OpenAI's API."""
 
     judge: Judge
 
@@ -60,12 +60,12 @@ class Handler(BaseHTTPRequestHandler):
         self.wfile.write(body)
 
     def log_message(self, format: str, *args: object) -> None:
-        """Say nothing of requests."""
+        """Log no requests."""
 
 
 @contextmanager
 def serving(handler: type[Handler]) -> Iterator[str]:
-    """A server on the loopback address while the block runs; its base address."""
+    """Serve on the loopback address while the block runs; yield the base address."""
     with ThreadingHTTPServer(("127.0.0.1", 0), handler) as server:
         thread = Thread(target=server.serve_forever, kwargs={"poll_interval": 0.05}, daemon=True)
         thread.start()
@@ -77,7 +77,7 @@ def serving(handler: type[Handler]) -> Iterator[str]:
 
 
 def by_psnr(truths: Sequence[np.ndarray]) -> Judge:
-    """A judge that chooses the picture nearest to the truth: that of ``truths`` which both are like."""
+    """Return a judge that chooses the picture nearer to the truth, which it finds among ``truths``."""
 
     def judge(first: np.ndarray, second: np.ndarray) -> str:
         truth = max(truths, key=lambda each: psnr(first, each) + psnr(second, each))
@@ -87,7 +87,7 @@ def by_psnr(truths: Sequence[np.ndarray]) -> Judge:
 
 
 def made_pictures(seed: int) -> tuple[np.ndarray, Picture]:
-    """Truth (K, H, W, 3) of a drawn scene, and pictures of it by two methods, one noisier than the other."""
+    """Return the truth (K, H, W, 3) of a drawn scene, and two methods' pictures, one of them noisier."""
     truth = made_clip()[2]
 
     def picture(question: Question, method: str) -> bytes:
@@ -101,7 +101,7 @@ def made_pictures(seed: int) -> tuple[np.ndarray, Picture]:
 
 
 def check_rows(folder: Path, seed: int) -> Iterator[Row]:
-    """Figures of both known judges, and whether position bias is found in the one that has it alone."""
+    """Yield rows of both known judges, and whether position bias is found only in the biased one."""
     truth, picture = made_pictures(seed)
     scenes = {"made": (["lamp"], len(truth))}
     asked = controls(scenes, seed) + questions(scenes, BETTER, [WORSE], len(truth), [seed])

@@ -1,4 +1,4 @@
-"""What the judge is told, from the TRON paper's "A/B Photorealism Additional Details", and its reply."""
+"""The judge's prompt, from the TRON paper's "A/B Photorealism Additional Details", and its reply."""
 
 from __future__ import annotations
 
@@ -45,6 +45,6 @@ _TOKEN = re.compile(r"\W*(A|B|TIE)\W*", re.IGNORECASE)
 
 
 def read_answer(text: str) -> Answer | None:
-    """The single token of a reply, None for anything else; thoughts before it are passed over."""
+    """Return the single token of a reply, None for anything else; preceding thoughts are skipped."""
     found = _TOKEN.fullmatch(_THOUGHT.sub("", text))
     return None if found is None else found[1].upper()  # type: ignore[return-value]

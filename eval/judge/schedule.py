@@ -1,4 +1,4 @@
-"""Which pairs of pictures are judged: the paper's five views a scene and light, three seeds, both orders."""
+"""Pairs of pictures to judge: as in the paper, five views per scene and light, three seeds, both orders."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ class Question:
     second: str
 
     def swapped(self) -> Question:
-        """The same pair in the other order."""
+        """The pair in the other order."""
         return Question(self.scene, self.light, self.view, self.seed, self.second, self.first)
 
 
@@ -38,15 +38,15 @@ def questions(
     views: int,
     seeds: Sequence[int],
 ) -> list[Question]:
-    """Every pair in both orders, in random order, so that an early end leaves a fair sample.
+    """Return every pair in both orders, shuffled, so that an early end leaves a fair sample.
 
-    A seed draws the views, the same for all rivals, and is sent to the judge, which may answer otherwise.
+    A seed draws the views, the same for all rivals, and is sent to the judge, whose answer may depend on it.
 
     Args:
         scenes: name -> its lights, and its number of test views.
-        ours: the method that is held against the ``rivals``.
+        ours: method to compare with the ``rivals``.
         rivals: other methods.
-        views: drawn a scene and light; all where there are no more.
+        views: number of views per scene and light; all views if there are fewer.
         seeds: the rounds.
     """
     found = []
@@ -62,7 +62,7 @@ def questions(
 
 
 def controls(scenes: Mapping[str, tuple[Sequence[str], int]], seed: int) -> list[Question]:
-    """At most CONTROLS pairs of a picture and itself spoiled, in both orders, over all scenes and lights."""
+    """Return at most CONTROLS pairs of a picture and its spoiled copy, in both orders, over all lights."""
     every = [
         Question(scene, light, view, seed, CONTROL, SPOILED)
         for scene, (lights, count) in scenes.items()
@@ -74,7 +74,7 @@ def controls(scenes: Mapping[str, tuple[Sequence[str], int]], seed: int) -> list
 
 
 def spoiled(picture: np.ndarray) -> np.ndarray:
-    """A picture (H, W, 3) in blocks of a sixteenth of its shorter side: worse by the prompt's words."""
+    """Pixelate a picture (H, W, 3) in blocks of 1/16 of its shorter side: worse by the prompt's criteria."""
     height, width = picture.shape[:2]
     block = max(2, min(height, width) // 16)
     rows, columns = np.arange(0, height, block), np.arange(0, width, block)
@@ -84,10 +84,10 @@ def spoiled(picture: np.ndarray) -> np.ndarray:
 
 
 def pairs(asked: Sequence[Question]) -> Iterator[tuple[Question, Question]]:
-    """Each pair's two orders, that which shows the first-named method of the two first coming first.
+    """Yield both orders of each pair; the order that shows the first-named method first comes first.
 
     Raises:
-        ValueError: a pair was asked in one order alone.
+        ValueError: a pair was asked in one order only.
     """
     there = set(asked)
     seen: set[Question] = set()

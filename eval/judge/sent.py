@@ -1,4 +1,4 @@
-"""Pictures that a judge is sent, as PNG files that anyone can look at."""
+"""Pictures for the judge, as PNG files that anyone can view."""
 
 from __future__ import annotations
 
@@ -19,13 +19,13 @@ log = logging.getLogger("tron.eval")
 
 
 class Sent:
-    """``folder/METHOD/SCENE/LIGHT/NNNN.png``, of the views that are asked about alone."""
+    """Files ``folder/METHOD/SCENE/LIGHT/NNNN.png`` of the views in the questions."""
 
     def __init__(self, folder: Path):
         self.folder = folder
 
     def __call__(self, question: Question, method: str) -> bytes:
-        """The picture of a method that a question shows."""
+        """Return the picture of a method in a question."""
         return self._path(method, question.scene, question.light, question.view).read_bytes()
 
     def _path(self, method: str, scene: str, light: str, view: int) -> Path:
@@ -38,9 +38,9 @@ class Sent:
         ours: str,
         asked: Iterable[Question],
     ) -> dict[str, str]:
-        """Write all that is asked about, a method's scene at a time; method -> what is wrong with it.
+        """Write all pictures of the questions, scene by scene; return method -> its fault.
 
-        The control's picture is the truth, or ours where that is unknown.
+        The control's picture is the truth, or ours if the truth is unknown.
         """
         views: dict[tuple[str, str], set[int]] = {}
         for each in asked:

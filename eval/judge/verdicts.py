@@ -1,4 +1,4 @@
-"""Answers -> figures: who wins, and whether the judge is fit to say so."""
+"""Turn answers into figures: win rates, and the fitness of the judge."""
 
 from __future__ import annotations
 
@@ -27,13 +27,13 @@ LEAST_SCENES = 6
 
 
 def share_won(question: Question, answer: Answer, method: str) -> float:
-    """1 where the method's picture was chosen, 0 where the other was, 0.5 of a tie."""
+    """Return 1 if the method's picture was chosen, 0 if the other was, 0.5 for a tie."""
     return {"TIE": 0.5, "A": float(question.first == method), "B": float(question.second == method)}[answer]
 
 
 @dataclass(frozen=True)
 class Fitness:
-    """What is known of a judge beside what it says of methods.
+    """Fitness of a judge, independent of its verdicts on methods.
 
     Attributes:
         controls: share of control pairs that were won in both orders.
@@ -53,16 +53,16 @@ class Fitness:
 
     @property
     def control_won(self) -> bool:
-        """Whether it tells a picture from the same in blocks."""
+        """Whether the judge tells a picture from its pixelated copy."""
         return self.controls >= CONTROL_SHARE
 
     @property
     def by_position(self) -> bool:
-        """Whether it answers by position."""
+        """Whether the judge answers by position."""
         return abs(self.bias) >= BIAS and self.bias_p < BIAS_P
 
     def faults(self) -> list[str]:
-        """Why the judge is unfit, in words; empty where it is fit."""
+        """Reasons why the judge is unfit, in words; empty if it is fit."""
         return [
             words
             for wrong, words in (
@@ -75,7 +75,7 @@ class Fitness:
 
     @classmethod
     def of(cls, found: Found) -> Fitness:
-        """Measure by all answers, those to control pairs among them."""
+        """Measure by all answers, including answers to control pairs."""
         both: list[tuple[Question, Answer | None, Answer | None, Question]] = [
             (one, found[one], found[other], other) for one, other in pairs(list(found))
         ]
@@ -99,7 +99,7 @@ class Fitness:
         )
 
     def rows(self, prefix: str = "judge") -> Iterator[Row]:
-        """Its figures; ``prefix`` names the judge."""
+        """Yield rows of the judge's fitness; ``prefix`` names the judge."""
         figures = {
             "control_share": self.controls,
             "control_won": float(self.control_won),
@@ -115,9 +115,9 @@ class Fitness:
 
 
 def rival_rows(found: Found, ours: str, rival: str, seeds: Sequence[int], seed: int) -> Iterator[Row]:
-    """Win rate of ours over a rival, its deviation over seeds, ties, and Wilcoxon's test over scenes.
+    """Yield our win rate over a rival, its deviation over seeds, ties, and Wilcoxon's test over scenes.
 
-    Ties are half a win; answers that are none are left out, and ``n`` counts those that are there.
+    Ties are half a win; invalid answers are left out, and ``n`` counts valid ones.
     """
     said: dict[Question, Answer] = {
         question: answer

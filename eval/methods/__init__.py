@@ -1,1 +1,1 @@
-"""Methods that write folders of the protocol, one a file."""
+"""Methods that write folders of the protocol, one file each."""

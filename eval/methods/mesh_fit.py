@@ -1,12 +1,12 @@
-"""A mesh whose materials and light are fitted to photos by Mitsuba, and which Mitsuba path-traces anew.
+"""Fit materials and light of a mesh to photos by Mitsuba, and path-trace the mesh under new lights.
 
-What an engineer would do today without Gaussians. The surface is that of the capture as a mesh: depths of
-many views fused, marching cubes (:mod:`tron.meshing.surface`). The depths are those of TRON's own
-reconstruction; its surfels also give the colours that the mesh begins with, and nothing else: no material and
-no light of ours is known to it. Base color, roughness and metallic stand at the vertices, which lie as
-densely as the grid, so that there is no atlas with seams between which nothing can be smoothed. They are
-fitted together with a lat-long light by Mitsuba's ``prb`` (path replay backpropagation, Vicini et al. 2021)
-and Adam; ``path`` shows the mesh under other lights, with Intel's Open Image Denoise over the frames.
+This is what an engineer would do today without Gaussians. The mesh is the surface of the capture: depths of
+many views are fused, then meshed by marching cubes (:mod:`tron.meshing.surface`). The depths and the initial
+colours come from TRON's own reconstruction; no material and no light of ours is used. Base color, roughness
+and metallic are stored at the vertices, which are as dense as the grid, so there is no atlas whose seams
+would hinder smoothing. They are fitted together with a lat-long light by Mitsuba's ``prb`` (path replay
+backpropagation, Vicini et al. 2021) and Adam; ``path`` renders the mesh under other lights, and Intel's Open
+Image Denoise filters the frames.
 """
 
 # pyright: reportArgumentType=false, reportCallIssue=false, reportAttributeAccessIssue=false
@@ -65,27 +65,29 @@ _EDGE = 0.02
 
 
 class MeshSettings(BaseModel):
-    """The mesh and its fit; defaults were chosen on development scenes (dev/LOG.md, 2026-11-27)."""
+    """Settings of mesh and fit; defaults were chosen on development scenes (dev/LOG.md, 2026-11-27)."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    voxels: PositiveInt = Field(default=128, description="of the mesh's grid, along the longest side")
+    voxels: PositiveInt = Field(default=128, description="voxels of the mesh's grid along its longest side")
     light_height: PositiveInt = Field(default=32, description="rows of the fitted light")
-    steps: PositiveInt = Field(default=150, description="of Adam, one photo each")
-    spp: PositiveInt = Field(default=8, description="paths a pixel of a step, and as many of its gradient")
-    bounces: PositiveInt = Field(default=1, description="of light between surfaces in the fit")
+    steps: PositiveInt = Field(default=150, description="steps of Adam, one photo each")
+    spp: PositiveInt = Field(default=8, description="samples per pixel of a step, and again of its gradient")
+    bounces: PositiveInt = Field(default=1, description="bounces of light between surfaces in the fit")
     color_rate: PositiveFloat = Field(default=0.03, description="learning rate of base color")
-    surface_rate: PositiveFloat = Field(default=0.03, description="of roughness and metallic")
-    light_rate: PositiveFloat = Field(default=0.05, description="of the logarithm of the light")
+    surface_rate: PositiveFloat = Field(default=0.03, description="learning rate of roughness and metallic")
+    light_rate: PositiveFloat = Field(default=0.05, description="learning rate of the logarithm of the light")
     smooth_color: NonNegativeFloat = Field(
-        default=0.02, description="weight of base color's steps along edges"
+        default=0.02, description="smoothing weight of base color at edges"
     )
-    smooth_surface: NonNegativeFloat = Field(default=0.02, description="of roughness' and metallic's")
-    smooth_light: NonNegativeFloat = Field(default=0.002, description="of the logarithm of the light's")
+    smooth_surface: NonNegativeFloat = Field(default=0.02, description="smoothing of roughness and metallic")
+    smooth_light: NonNegativeFloat = Field(
+        default=0.002, description="smoothing weight of the light's logarithm"
+    )
     plain: NonNegativeFloat = Field(
-        default=0.01, description="pull of metallic to 0 and of roughness to where it began"
+        default=0.01, description="weight that pulls metallic to 0 and roughness to its initial value"
     )
-    frame_spp: PositiveInt = Field(default=64, description="paths a pixel of a frame under a new light")
+    frame_spp: PositiveInt = Field(default=64, description="samples per pixel of a frame under a new light")
 
 
 @dataclass(frozen=True, eq=False)
@@ -107,7 +109,7 @@ class PaintedMesh:
     metallic: np.ndarray
 
     def lit(self, light: EnvironmentMap) -> mi.Scene:
-        """The mesh under a light. Its material is that of :mod:`tron.brdf`, on both sides."""
+        """Return the mesh under a light, two-sided, with the material of :mod:`tron.brdf`."""
         attributes = {name: {"type": "mesh_attribute", "name": f"vertex_{name}"} for name in MATERIALS}
         bsdf = {"type": "twosided", "bsdf": metallic_roughness(**attributes)}
         mesh = mitsuba_mesh("mesh", mi.load_dict(bsdf), self.vertices, self.normals, self.faces, None)
@@ -121,10 +123,10 @@ class MeshFit:
     """A fitted mesh.
 
     Attributes:
-        mesh: with its materials.
-        light: what lit the photos, in their unit.
-        seconds: of the mesh and of the fit; the surfels' are not among them.
-        losses: of every step.
+        mesh: mesh with fitted materials.
+        light: light of the photos, in their unit.
+        seconds: time of meshing and fit, without making the surfels.
+        losses: loss of every step.
     """
 
     mesh: PaintedMesh
@@ -136,14 +138,14 @@ class MeshFit:
 def fit_mesh(
     capture: Capture, scene: GaussianScene, settings: MeshSettings, seed: int, track: Track
 ) -> MeshFit:
-    """Make the mesh of a capture, and fit its materials and its light to the training photos.
+    """Make a mesh of a capture, and fit its materials and light to the training photos.
 
     Args:
-        capture: photos with their cameras; where they have masks, only what is covered counts.
-        scene: surfels of it, in the same world, z up, whose depths and mean colours are used.
-        settings: of mesh and fit.
-        seed: of every random choice.
-        track: wraps loops, with their labels.
+        capture: photos with their cameras; if they have masks, only covered pixels count.
+        scene: surfels of the capture in its world, z up; their depths and mean colours are used.
+        settings: settings of mesh and fit.
+        seed: seed of every random choice.
+        track: progress wrapper of loops, with their labels.
 
     Raises:
         TronError: the views see no surface, or the photos show none of it.
@@ -158,7 +160,7 @@ def fit_mesh(
 
 
 def plain_mesh(capture: Capture, scene: GaussianScene, settings: MeshSettings, track: Track) -> PaintedMesh:
-    """The mesh in the colours that photos show, dielectric and of middling roughness."""
+    """Return the mesh in the colours of the photos, dielectric, with medium roughness."""
     cameras = capture.train_cameras
     longer = max(max(camera.width, camera.height) for camera in cameras)
     surface = surface_of(
@@ -185,14 +187,14 @@ def lit_frames(
     seeds: Sequence[int],
     background: bool = True,
 ) -> Iterator[np.ndarray]:
-    """Path-trace a mesh under a light, one frame a camera, without noise.
+    """Path-trace and denoise a mesh under a light, one frame per camera.
 
     Args:
-        mesh: such as a :class:`MeshFit` has.
-        cameras: of the frames.
-        light: the new one.
-        spp: paths a pixel.
-        seeds: one a frame.
+        mesh: mesh of a :class:`MeshFit`.
+        cameras: cameras of the frames.
+        light: the new light.
+        spp: samples per pixel.
+        seeds: one per frame.
         background: whether the light itself is seen behind the mesh; black otherwise.
 
     Yields:
@@ -211,7 +213,7 @@ def lit_frames(
 
 
 def surface_maps(mesh: PaintedMesh, cameras: Sequence[Camera]) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Linear base color and unit world normals, (H, W, 3) each, at pixel centres; 0 off the mesh."""
+    """Yield linear base color and unit world normals (H, W, 3) at pixel centres; 0 off the mesh."""
     scene = mesh.lit(EnvironmentMap.constant(1.0))
     for camera in cameras:
         along = camera.rays().reshape(-1, 3)
@@ -226,7 +228,7 @@ def surface_maps(mesh: PaintedMesh, cameras: Sequence[Camera]) -> Iterator[tuple
 
 @dataclass(frozen=True)
 class _Photo:
-    """What a step compares with: linear light in the photos' unit, and the pixels that count."""
+    """Target of a step: linear radiance in the photos' unit, and the mask of pixels that count."""
 
     sensor: mi.Sensor
     light: mi.TensorXf
@@ -235,7 +237,7 @@ class _Photo:
 
 
 class _Fit:
-    """Materials and light under way."""
+    """Materials and light during the fit."""
 
     def __init__(self, mesh: PaintedMesh, capture: Capture, settings: MeshSettings, seed: int) -> None:
         self._mesh, self._settings, self._seed = mesh, settings, seed
@@ -271,7 +273,7 @@ class _Fit:
         self._order, self._queue = generator(seed, "mesh peer", "photos"), list[int]()
 
     def _first_light(self) -> float:
-        """Radiance from everywhere under which the mesh is as bright as the photos."""
+        """Return the constant radiance under which the mesh is as bright as the photos."""
         arrived, shown = np.zeros(3), np.zeros(3)
         for photo in self._photos[:: max(len(self._photos) // 8, 1)]:
             image = mi.render(self._scene, sensor=photo.sensor, integrator=self._integrator, spp=4)
@@ -280,7 +282,7 @@ class _Fit:
         return max(float(luminance(shown) / max(luminance(arrived), 1e-12)), 1e-6)
 
     def _show(self) -> None:
-        """Hand the values to Mitsuba's scene."""
+        """Copy the values into Mitsuba's scene."""
         for name in MATERIALS:
             self._parameters[f"mesh.vertex_{name}"] = self._optimizer[name]
         self._parameters["light.data"] = self._around(dr.exp(self._optimizer["light"]))
@@ -290,7 +292,7 @@ class _Fit:
         return mi.TensorXf(dr.gather(mi.Float, texels.array, self._wrapped), self._shape)
 
     def step(self, number: int) -> float:
-        """One photo; the loss of it."""
+        """Fit to one photo; return the loss."""
         settings = self._settings
         if not self._queue:
             self._queue = self._order.permutation(len(self._photos)).tolist()
@@ -327,22 +329,22 @@ class _Fit:
         return found + s.plain * (plain + dr.mean(of["metallic"]))
 
     def _steps(self, kind: Any, values: mi.Float) -> Any:
-        """Mean step along edges: quadratic below _EDGE, linear above (Charbonnier)."""
+        """Return the mean difference along edges: quadratic below _EDGE, linear above (Charbonnier)."""
         one, other = (dr.gather(kind, values, end) for end in self._edges)
         return dr.mean(dr.sqrt(dr.squared_norm(one - other) + _EDGE**2) - _EDGE)
 
     def mesh(self) -> PaintedMesh:
-        """The mesh with its materials as they are."""
+        """Return the mesh with its current materials."""
         values = {name: np.array(self._optimizer[name]) for name in MATERIALS}
         return replace(self._mesh, **values | {"base_color": values["base_color"].reshape(-1, 3)})
 
     def light(self) -> EnvironmentMap:
-        """The light as it is."""
+        """Return the current light."""
         return EnvironmentMap(np.exp(np.array(self._optimizer["light"])))
 
 
 def _photo(view: View, capture: Capture) -> _Photo | None:
-    """A training photo on the device; None where it shows nothing."""
+    """Load a training photo onto the device; None if no pixel counts."""
     counts = view.believed()
     if view.has("mask"):
         counts &= view.read("mask") > COVERED

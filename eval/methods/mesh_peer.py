@@ -1,7 +1,7 @@
-"""The mesh peer: `tron-eval method=mesh_peer`, what an engineer would do today without Gaussians.
+"""The mesh peer, `tron-eval method=mesh_peer`: a mesh fitted to photos, without Gaussians.
 
-Each scene's surfels are TRON's, learnt from its photos up to where materials would be found; what becomes of
-them is in :mod:`eval.methods.mesh_fit`. All seconds count, those of the surfels too.
+Each scene's surfels are learnt by TRON from its photos, without materials; :mod:`eval.methods.mesh_fit` makes
+a mesh from them. Reported seconds include the surfels.
 """
 
 from __future__ import annotations
@@ -35,33 +35,33 @@ log = logging.getLogger("tron.eval")
 
 
 def only_photos(capture: Capture) -> Capture:
-    """The capture without the true maps that a suite may have beside its photos."""
+    """Return the capture without the true maps that a suite may have beside its photos."""
     bare = dict.fromkeys(MAPS.keys() - {"image", "mask", "valid"})
     return replace(capture, views=tuple(replace(view, **bare) for view in capture.views))
 
 
 class NoMaterials(Prior):
-    """Surfels of photos, and nothing else."""
+    """Prior without materials: surfels from photos only."""
 
     def check(self, capture: Capture) -> None:
-        """Photos are enough."""
+        """Accept any capture: photos are enough."""
 
     def find_materials(self, surfels: Surfels) -> Materials:
-        """None: the surfels stay as they were learnt."""
+        """Find no materials: the surfels stay as learnt."""
         return Materials(surfels.scene)
 
 
 class MeshPeer(Making):
-    """The mesh, and the reconstruction that gives its depths."""
+    """Settings: the mesh, and the reconstruction that gives its depths."""
 
-    mesh: MeshSettings = Field(default=MeshSettings(), description="the mesh and its fit")
+    mesh: MeshSettings = Field(default=MeshSettings(), description="settings of the mesh and its fit")
     surfels: ReconstructionSettings = Field(
         default=ReconstructionSettings(),
-        description="settings of tron-reconstruct for the surfels whose depths are fused",
+        description="settings of tron-reconstruct for the surfels, whose depths are fused",
     )
 
     def make(self, output_dir: Path) -> list[Path]:
-        """Scene by scene: surfels, mesh, fit, frames; a scene that is all there is passed over."""
+        """Make surfels, mesh, fit and frames scene by scene; finished scenes are skipped."""
         suite = self.read_suite()
         require_own_packages("tron.reconstruction")
         require(DENOISER, "method=mesh_peer")
@@ -89,7 +89,7 @@ class MeshPeer(Making):
     def _show(
         self, scene: SuiteScene, settings: ReconstructionSettings, writer: MethodWriter
     ) -> tuple[float, float]:
-        """Write a scene; seconds of its fit, surfels included, and of a frame."""
+        """Write a scene; return seconds of its fit, surfels included, and of a frame."""
         capture, begun = only_photos(read_capture_folder(scene.train)), time.perf_counter()
         surfels: GaussianScene = reconstruct(capture, NoMaterials(), settings, track=track).scene
         seed = integer(self.seed, "mesh peer", scene.name)

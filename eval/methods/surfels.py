@@ -1,9 +1,9 @@
-"""TRON's own methods: surfels of a scene under every light, by each of its ways to make a picture of them.
+"""TRON's own methods: render a scene's surfels under every light, by each of several ways.
 
 Surfels are made from the training views' true maps, or reconstructed from the photos by tron-reconstruct.
-Buffers are traced once a frame for all ways, whose formulas are those of :mod:`eval.relighting`. Pictures
-are linear, so that those from photos can have their one factor on light; a network's display values are
-taken back through AgX where they need it.
+Buffers are traced once per frame for all ways; :mod:`eval.relighting` has the formulas of the ways. Pictures
+are linear, so that one factor on light can be fitted to reconstructions from photos; for these the display
+values of a network are taken back through AgX.
 """
 
 from __future__ import annotations
@@ -60,26 +60,26 @@ MADE: Mapping[str, Callable[[Buffers], np.ndarray]] = {
     "pbr_x_irradiance": lambda buffers: sum(product_terms(buffers)) / buffers.exposure,  # pyright: ignore
     "shadow_ratio": baselines.shadow_ratio,
 }
-"""Way -> linear radiance (K, H, W, 3), of those that are no buffer themselves. The product's fitted number is
-left to the factor on light."""
+"""Way -> linear radiance (K, H, W, 3), for ways that are not a buffer. The product has no fitted scale here;
+the factor on light replaces it."""
 _FIELDS = ("depth", "normal", "base_color", "roughness", "metallic")
 
 
 class Surfels(Making):
-    """Surfels of every scene, and the ways that show them; a folder ``NAME_WAY`` each."""
+    """Settings: surfels of every scene, and ways to render them; each way writes a folder ``NAME_WAY``."""
 
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,19}$", description="begins the methods' names")
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,19}$", description="prefix of the methods' names")
     surfels: Literal["true_maps", "photos"] = Field(
-        description="true_maps: through the true surfaces of the training views; photos: by tron-reconstruct"
+        description="true_maps: from true maps of the training views; photos: by tron-reconstruct"
     )
-    ways: list[Way] = Field(description="that show them", min_length=1)
-    quality: Literal["preview", "final"] = Field(description="of tron-relight")
-    count: PositiveInt = Field(description="surfels of a scene, where they are from true maps")
-    reconstruct: list[str] = Field(description="arguments of tron-reconstruct, where they are from photos")
-    renderer: str = Field(description="weights of the way network: a file, or a shipped checkpoint's name")
+    ways: list[Way] = Field(description="ways to render the surfels", min_length=1)
+    quality: Literal["preview", "final"] = Field(description="quality, as in tron-relight")
+    count: PositiveInt = Field(description="number of surfels of a scene with surfels=true_maps")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct with surfels=photos")
+    renderer: str = Field(description="weights for the way network: a file, or a shipped checkpoint's name")
 
     def make(self, output_dir: Path) -> list[Path]:
-        """Scene by scene: surfels, lights, frames; a scene whose folders are all there is passed over."""
+        """Make surfels, lights and frames scene by scene; finished scenes are skipped."""
         suite, stages = self.read_suite(), None
         for way in DENOISED.keys() & self.ways:
             require(DENOISED[way], f"method.ways=[{way}]")
@@ -132,7 +132,7 @@ class Surfels(Making):
         )
 
     def _surfels(self, scene: SuiteScene, folder: Path, stages: Stages | None) -> tuple[GaussianScene, float]:
-        """Surfels, and the seconds that they took."""
+        """Return surfels, and the seconds to make them."""
         begun = time.perf_counter()
         if stages is None:
             capture = read_capture_folder(scene.train)
@@ -151,7 +151,7 @@ class Surfels(Making):
         network: Network | None,
         writers: Mapping[Way, MethodWriter],
     ) -> list[float]:
-        """Write the scene's pictures and maps; the seconds of each frame."""
+        """Write the scene's pictures and maps; return the seconds of each frame."""
         capture, seconds = read_capture_folder(scene.train), []
         proxy = "auto" if self.surfels == "photos" else "never"  # what true maps make is one layer
         estimation, cameras = QUALITY[self.quality], capture.train_cameras
@@ -186,7 +186,7 @@ class Surfels(Making):
     def _frame(
         self, lit: Illumination, scene: SuiteScene, light: str, k: int, camera: Camera
     ) -> dict[str, np.ndarray]:
-        """Buffers of a frame that ways and networks see, before the environment."""
+        """Return the buffers of a frame for ways and networks, over the environment."""
         frame = lit.trace(camera, integer(self.seed, "methods", scene.name, light, k))
         guidance = frame.shade()
         (maps,) = lit.relighter.surface_maps(camera, lit.estimation)
@@ -199,7 +199,7 @@ class Surfels(Making):
 
 
 def _require_true_maps(suite: Suite) -> None:
-    """TronError where a training view lacks a map that surfels are made from."""
+    """Raise TronError if a training view lacks a map that surfels need."""
     for scene in suite.scenes.values():
         for view in read_capture_folder(scene.train).views:
             if missing := [name for name in _FIELDS if not view.has(name)]:
@@ -208,7 +208,7 @@ def _require_true_maps(suite: Suite) -> None:
 
 
 def _true_views(scene: SuiteScene) -> Iterator[GBufferView]:
-    """G-buffers of the training views."""
+    """Yield G-buffers of the training views."""
     for view in read_capture_folder(scene.train).views:
         depth, normal = view.read("depth"), view.read("normal")
         yield GBufferView(

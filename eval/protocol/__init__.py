@@ -1,1 +1,1 @@
-"""The folders that methods are compared by: suites of scenes, and pictures that methods made of them."""
+"""Folders for comparisons of methods: suites of scenes, and methods' pictures of them."""

@@ -1,4 +1,4 @@
-"""`tron-eval export=SUITE`: suites from captures of tron-datagen, from anyone's captures, and TensoIR's.
+"""`tron-eval export=SUITE`: suites from captures of tron-datagen, from any captures, and from TensoIR.
 
 ``conf/eval/export/NAME.yaml`` names the class by ``_target_``.
 """
@@ -39,17 +39,17 @@ TENSOIR_LIGHTS = ("bridge", "city", "fireplace", "forest", "night")
 
 
 class Export(BaseModel, abc.ABC):
-    """What all exports are told."""
+    """Settings of all exports."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,39}$", description="of the suite")
+    name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,39}$", description="name of the suite")
 
     def write(self, output_dir: Path) -> Suite:
         """Write the suite at ``output_dir/NAME``.
 
         Raises:
-            TronError: an input is missing or is not what it should be, or the folder is taken.
+            TronError: an input is missing or is not what it should be, or the folder is not empty.
             StageFailed: the command that makes the scenes failed.
         """
         require_new(output_dir / self.name)
@@ -60,13 +60,13 @@ class Export(BaseModel, abc.ABC):
 
 
 class Synthetic(Export):
-    """Path-traced captures with their relit views: the true answer under every light is known."""
+    """Path-traced captures with relit views: the truth under every light is known."""
 
     captures: Path | None = Field(
         description="folder of tron-datagen mode=captures or mode=pseudo_captures; null: recipe makes it"
     )
-    recipe: list[str] = Field(description="arguments of tron-datagen, where captures is null")
-    scenes: PositiveInt | None = Field(default=None, description="the first so many alone; null: all")
+    recipe: list[str] = Field(description="arguments of tron-datagen if captures is null")
+    scenes: PositiveInt | None = Field(default=None, description="maximum number of scenes; null: all")
 
     def _laid_out(self, output_dir: Path) -> Suite:
         made = self.captures or self._made(output_dir)
@@ -131,16 +131,14 @@ class Synthetic(Export):
 
 
 class Photos(Export):
-    """Captures of anyone under maps of anyone: there is no truth, and what judges looks at pictures alone."""
+    """Any captures under any maps: there is no truth, so only judges of pictures apply."""
 
     captures: Path | None = Field(description="a capture, or a folder of captures, of any format")
-    lights: list[Path] = Field(description="lat-long maps, as many as lights of each capture")
+    lights: list[Path] = Field(description="lat-long maps, the lights of every capture")
     turns_deg: list[float] = Field(
-        min_length=1, description="by how much each map is turned about the zenith; the last goes on"
+        min_length=1, description="turn of each map about the zenith; further maps use the last value"
     )
-    max_side: PositiveInt | None = Field(
-        description="photos are reduced to so many pixels a side; null: as they are"
-    )
+    max_side: PositiveInt | None = Field(description="maximum side of the photos in pixels; null: unchanged")
 
     def _laid_out(self, output_dir: Path) -> Suite:
         if self.captures is None or not self.lights:
@@ -176,11 +174,11 @@ class Photos(Export):
 
 
 class Tensoir(Export):
-    """TensoIR's synthetic scenes, as its authors lay them out: SCENE/train_000, SCENE/test_000, maps."""
+    """TensoIR's synthetic scenes in the layout of its authors: SCENE/train_000, SCENE/test_000, maps."""
 
-    root: Path | None = Field(description="folder of the scenes, such as the one that holds lego/")
-    maps: Path | None = Field(description="folder of the lights' .hdr; null: root/Environment_Maps")
-    lights: list[str] = Field(min_length=1, description="that scenes are relit under")
+    root: Path | None = Field(description="folder of the scenes; it has lego/ in it")
+    maps: Path | None = Field(description="folder of the .hdr lights; null: root/Environment_Maps")
+    lights: list[str] = Field(min_length=1, description="names of the lights for relighting")
 
     def _laid_out(self, output_dir: Path) -> Suite:
         if self.root is None:
@@ -222,7 +220,7 @@ class Tensoir(Export):
 
 
 def from_tensoir(path: Path) -> EnvironmentMap:
-    """A light of TensoIR, whose maps have azimuth 0 in the middle and grow to the left: a quarter turn.
+    """Turn a TensoIR light by 90 degrees: its maps have azimuth 0 in the middle, growing to the left.
 
     Its u is 1/2 - atan2(y, x) / 2 pi (models/relight_utils.py, get_light), ours 1/4 - atan2(y, x) / 2 pi.
     """
@@ -231,14 +229,14 @@ def from_tensoir(path: Path) -> EnvironmentMap:
 
 
 def _write_train(capture: Capture, without: frozenset[str], path: Path) -> None:
-    """The views that may be seen, in the curve that they went through."""
+    """Write the training views in their original tone curve."""
     views = tuple(view for view in capture.views if view.name not in without)
     curve: ToneCurve = capture.tone_curve
     write_capture(path, replace(capture, views=views, test=frozenset()), tone_curve=curve)
 
 
 def _relit(folder: Path, name: str) -> dict[str, Path]:
-    """``1_high`` -> the folder of a scene's views under it."""
+    """Return ``1_high`` -> the folder of a scene's views under this light."""
     found = (path for path in folder.glob(f"{name}_*") if path.is_dir())
     numbered = {path.name.removeprefix(f"{name}_"): path for path in found}
     return dict(sorted(numbered.items(), key=lambda each: (int(each[0].partition("_")[0]), each[0])))

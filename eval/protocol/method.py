@@ -1,11 +1,11 @@
-"""A method: its pictures of a suite's test cameras under the suite's lights, and what it says of them.
+"""A method's folder: pictures of a suite's test cameras under the suite's lights, and method.yaml.
 
     METHOD/method.yaml                :class:`Method`
     METHOD/SCENE/LIGHT/NNNN.png|exr   every test camera under every light
     METHOD/SCENE/albedo/NNNN.*        optional; .exr linear, .png by the sRGB curve
     METHOD/SCENE/normals/NNNN.*       optional; .exr (x, y, z), .png (n + 1) / 2
 
-Nobody is treated specially: TRON's own methods write such folders, by :func:`write_method`.
+TRON's own methods write the same folders, by :func:`write_method`.
 """
 
 from __future__ import annotations
@@ -35,7 +35,7 @@ _OPENGL = np.array([1.0, -1.0, -1.0])
 
 
 class Seconds(BaseModel):
-    """Wall time on ``machine``: to learn a scene, and to make one picture of it."""
+    """Wall time on ``machine`` to fit a scene, and to render one picture of it."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
@@ -44,30 +44,30 @@ class Seconds(BaseModel):
 
 
 class Method(BaseModel):
-    """The whole of method.yaml."""
+    """Contents of method.yaml."""
 
     model_config = ConfigDict(frozen=True, extra="forbid", allow_inf_nan=False)
 
     format: Literal["tron-method-1"] = "tron-method-1"
-    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,39}$", description="in rows: NAME.psnr")
-    title: str = Field(default="", description="in tables")
-    suite: str = Field(description="id of the suite whose cameras and lights these are")
+    name: str = Field(pattern=r"^[a-z][a-z0-9_]{0,39}$", description="name in rows: NAME.psnr")
+    title: str = Field(default="", description="title in tables")
+    suite: str = Field(description="id of the suite of the cameras and lights")
     color_space: ColorSpace = Field(
         description="of the pictures: linear, radiance without the suite's exposure; display, after exposure "
         "and tone curve; srgb, exposed radiance by the sRGB curve, clipped"
     )
     background: Literal["black", "environment", "white", "none"] = Field(
-        default="none", description="what stands behind the subject; none: it is not to be judged"
+        default="none", description="content behind the subject; none: not judged"
     )
     scale: Literal["absolute", "scene"] = Field(
         default="absolute",
-        description="scene: one factor on the light of each scene is fitted, as photos do not tell it",
+        description="scene: fit one factor on the light of each scene, which photos do not fix",
     )
     normals: Frame = Field(
         default="world",
         description="frame of the normals: world; opencv, x right, y down, z forward; opengl, y up, z back",
     )
-    saw: list[Given] = Field(default=[], description="what it was given of the scenes that are judged")
+    saw: list[Given] = Field(default=[], description="inputs that the method had of the judged scenes")
     citation: str = ""
     seconds: Seconds = Seconds()
     machine: str = ""
@@ -81,14 +81,14 @@ class Method(BaseModel):
 
 @dataclass(frozen=True)
 class MethodFolder:
-    """A method's folder; pictures are read, and their faults found, when they are asked for."""
+    """A method's folder; pictures are read and checked on demand."""
 
     folder: Path
     method: Method
 
     @classmethod
     def load(cls, folder: str | Path, suite: Suite) -> MethodFolder:
-        """Read method.yaml; TronError where it is missing, damaged, or of another suite."""
+        """Read method.yaml; TronError if it is missing, damaged, or of another suite."""
         folder = Path(folder)
         method = load_yaml(folder / METHOD_NAME, Method, "eval/protocol/method.py says what it holds")
         if method.suite != suite.id:
@@ -100,7 +100,7 @@ class MethodFolder:
         return cls(folder, method)
 
     def frames(self, scene: SuiteScene, light: str) -> np.ndarray:
-        """(K, H, W, 3) float32 as the method stored them, in its colour space; Fault for what is wrong."""
+        """Read frames (K, H, W, 3) float32 in the method's colour space; Fault if any is wrong."""
         lights = self.folder / scene.name
         require_folder(lights, self.folder, "missing_scene", f"scene {scene.name} is missing")
         found = [path.name for path in lights.iterdir() if path.is_dir()]
@@ -115,7 +115,7 @@ class MethodFolder:
         return shown
 
     def albedo(self, scene: SuiteScene) -> np.ndarray | None:
-        """(K, H, W, 3) linear base color; None where the method gives none."""
+        """Read linear base color (K, H, W, 3); None if the method has none."""
         found = self._maps(scene, "albedo")
         if found is None:
             return None
@@ -123,9 +123,9 @@ class MethodFolder:
         return np.asarray(srgb_to_linear(frames) if suffix == ".png" else frames, np.float32)
 
     def normals(self, scene: SuiteScene, frame: Frame | None = None) -> np.ndarray | None:
-        """(K, H, W, 3) normals in the world, of any length; None where the method gives none.
+        """Read world normals (K, H, W, 3) of any length; None if the method has none.
 
-        ``frame`` is the one that they are taken to be of, the method's own by default.
+        ``frame`` is the assumed frame of the stored normals, by default the method's declared one.
         """
         found = self._maps(scene, "normals")
         if found is None:
@@ -144,7 +144,7 @@ class MethodFolder:
 
 
 def to_world(normals: np.ndarray, frame: Frame, scene: SuiteScene) -> np.ndarray:
-    """Normals (K, H, W, 3) of a frame, in the world: a camera's, as rows, times its world-to-camera turn."""
+    """Turn normals (K, H, W, 3) of a frame to the world: row vectors times the world-to-camera rotation."""
     if frame == "world":
         return normals
     if frame == "opengl":
@@ -154,31 +154,31 @@ def to_world(normals: np.ndarray, frame: Frame, scene: SuiteScene) -> np.ndarray
 
 
 class MethodWriter:
-    """Writes a method's pictures, a scene's light at a time, each whole or not at all."""
+    """Writer of a method's pictures, one light of a scene at a time, whole or not at all."""
 
     def __init__(self, folder: Path, method: Method):
         self.folder, self._method, self._seconds = folder, method, Seconds()
 
     def has(self, scene: str, what: str) -> bool:
-        """Whether the frames of a light, or albedo or normals, are there already."""
+        """Whether the frames of a light, or albedo or normals, exist already."""
         return (self.folder / scene / what).is_dir()
 
     def frames(self, scene: str, light: str, frames: np.ndarray, suffix: str = ".exr") -> None:
-        """Keep the pictures (K, H, W, 3) of a light, in the method's colour space."""
+        """Write the pictures (K, H, W, 3) of a light, in the method's colour space."""
         values = "radiance" if self._method.color_space == "linear" else "display"
         self._write(scene, light, frames, values, suffix)
 
     def albedo(self, scene: str, frames: np.ndarray, suffix: str = ".exr") -> None:
-        """Keep linear base color (K, H, W, 3)."""
+        """Write linear base color (K, H, W, 3)."""
         stored = linear_to_srgb(np.clip(frames, 0, 1)) if suffix == ".png" else np.clip(frames, 0, 1)
         self._write(scene, "albedo", stored, "reflectance", suffix)
 
     def normals(self, scene: str, frames: np.ndarray, suffix: str = ".exr") -> None:
-        """Keep normals (K, H, W, 3), in the frame that the method says."""
+        """Write normals (K, H, W, 3), in the method's declared frame."""
         self._write(scene, "normals", frames * 0.5 + 0.5 if suffix == ".png" else frames, "vector", suffix)
 
     def seconds(self, fit: float | None = None, frame: float | None = None) -> None:
-        """Say how long a scene took to learn, and a picture to make."""
+        """Record the seconds to fit a scene, and to render a picture."""
         self._seconds = Seconds(fit=fit, frame=frame)
 
     def _write(
@@ -197,7 +197,7 @@ class MethodWriter:
 
 @contextmanager
 def write_method(folder: Path, method: Method) -> Iterator[MethodWriter]:
-    """Write a method's folder; what an earlier call finished is kept, and method.yaml comes at the end.
+    """Write a method's folder; finished parts of an earlier call are kept, and method.yaml is written last.
 
     Raises:
         TronError: the folder holds something else, or pictures of another method or suite.

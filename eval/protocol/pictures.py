@@ -1,7 +1,7 @@
-"""Pictures of the protocol's folders, read without mercy: what is not exactly as agreed is a named fault.
+"""Strict reader and writer of the protocol's pictures: every deviation from the format is a named fault.
 
-OpenEXR holds linear values (or, where a method says so, display values), PNG 8 bits. Nothing is resized,
-converted or taken for granted: a method's figure must not depend on what a reader guessed.
+OpenEXR holds linear values (or display values, if a method says so), PNG 8 bits. Nothing is resized,
+converted or assumed: a method's figure must not depend on a reader's guess.
 """
 
 from __future__ import annotations
@@ -48,7 +48,7 @@ _NO_COLORS = ("vector", *_PLANES)
 
 
 class Fault(TronError):
-    """Something that a folder of the protocol must not hold or lacks; ``kind`` names it in tables."""
+    """Something wrong or missing in a folder of the protocol; ``kind`` names it in tables."""
 
     def __init__(self, kind: FaultKind, what: str, where: str | Path | None = None, mend: str | None = None):
         super().__init__(what, where, mend)
@@ -59,7 +59,7 @@ class Fault(TronError):
 
 
 class Size(NamedTuple):
-    """Pixels."""
+    """Size in pixels."""
 
     width: int
     height: int
@@ -71,12 +71,12 @@ def frame_name(number: int, suffix: str) -> str:
 
 
 def read_frames(folder: Path, count: int, size: Size, values: Values) -> np.ndarray:
-    """The numbered frames of a folder, (K, H, W, C) float32 as stored; C is 1 or, of colours and vectors, 3.
+    """Read a folder's numbered frames, (K, H, W, C) float32 as stored; C is 1, or 3 for colours and vectors.
 
     Args:
-        folder: holds 0000.png, 0001.png, .. or .exr, all of one suffix; other files are passed over.
-        count, size: what there must be.
-        values: that are held; their range is checked.
+        folder: has 0000.png, 0001.png, .. or .exr, all of one suffix; other files are ignored.
+        count, size: required number and size.
+        values: kind of the stored values; their range is checked.
 
     Raises:
         Fault: the first thing that is wrong.
@@ -86,10 +86,10 @@ def read_frames(folder: Path, count: int, size: Size, values: Values) -> np.ndar
 
 
 def write_frames(folder: Path, frames: np.ndarray, values: Values, suffix: str) -> None:
-    """Write frames (K, H, W, C) as :func:`read_frames` reads them; the folder must be there.
+    """Write frames (K, H, W, C) for :func:`read_frames`; the folder must exist.
 
-    Radiance and reflectance are halves, directions and display values of .exr are in full precision, so that
-    what is read is what was written; .png holds 8 bits of display values, or of directions' (n + 1) / 2.
+    In .exr, radiance and reflectance are half floats; directions and display values are float32, so they are
+    read back exactly. A .png has 8 bits of display values, or of (n + 1) / 2 for directions.
     """
     for number, frame in enumerate(np.asarray(frames, np.float32)):
         if suffix == ".exr":
@@ -141,7 +141,7 @@ def _check_size(found: Size, size: Size, path: Path) -> None:
 
 
 def _check_png(path: Path, size: Size) -> None:
-    """Refuse by its header a PNG that is not 8 bits of grey or RGB; nothing is decoded."""
+    """Refuse a PNG whose header is not 8-bit grey or RGB; nothing is decoded."""
     with open(path, "rb") as file:
         header = file.read(_PNG_DEPTH_AT + 1)
     if header.startswith(_PNG) and header[_PNG_DEPTH_AT:] == b"\x10":
@@ -163,7 +163,7 @@ def _check_png(path: Path, size: Size) -> None:
 
 
 def require_folder(folder: Path, root: Path, kind: FaultKind, what: str, names: Sequence[str] = ()) -> None:
-    """Raise a Fault unless a folder is there and lies, links followed, within ``root``."""
+    """Raise a Fault unless a folder exists and is, with links resolved, inside ``root``."""
     if not folder.is_dir():
         there = f"; there are {', '.join(names[:8])}" if names else ""
         raise Fault(kind, f"{what}{there}", folder)

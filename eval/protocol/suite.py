@@ -1,4 +1,4 @@
-"""A suite: scenes with training views, lights and test cameras, and the truth that methods are held to.
+"""A suite: scenes with training views, lights, test cameras, and the truth for comparisons.
 
     SUITE/suite.yaml                   names, lights, exposures; the id that methods cite
     SUITE/SCENE/train/                 training views, a capture folder (tron.captures.folder)
@@ -10,7 +10,7 @@
                                        depth/NNNN.exr distance along the rays, world units, 0 of nothing
 
 ``id`` is the suite's name and a digest of cameras, lights and truth: figures of two suites are comparable
-where their ids are the same. A folder is written whole or not at all; what is read is checked.
+if their ids are equal. A folder is written whole or not at all, and checked when it is read.
 """
 
 from __future__ import annotations
@@ -75,18 +75,18 @@ class SuiteLight(_Described):
     """A light of a scene."""
 
     exposure: PositiveFloat = Field(description="factor on linear values before the tone curve")
-    truth: bool = Field(description="whether the test cameras' pictures under it are known")
+    truth: bool = Field(description="whether the true pictures of the test cameras under it are known")
     family: str = Field(default="", description="groups rows: high, medium, ...")
 
 
 class SceneEntry(_Described):
-    """What suite.yaml says of a scene."""
+    """Entry of a scene in suite.yaml."""
 
     kind: str = Field(default="", description="groups rows: object, table, photos, ...")
-    frames: PositiveInt = Field(le=10_000, description="test cameras")
+    frames: PositiveInt = Field(le=10_000, description="number of test cameras")
     width: PositiveInt = Field(le=16_384)
     height: PositiveInt = Field(le=16_384)
-    maps: list[MapName] = Field(default=[], description="what else is known")
+    maps: list[MapName] = Field(default=[], description="further known truth")
     lights: dict[Name, SuiteLight] = Field(min_length=1)
 
     @field_validator("lights")
@@ -98,20 +98,20 @@ class SceneEntry(_Described):
 
 
 class SuiteFile(_Described):
-    """The whole of suite.yaml."""
+    """Contents of suite.yaml."""
 
     format: Literal["tron-suite-1"] = "tron-suite-1"
     name: str = Field(pattern=r"^[a-z0-9][a-z0-9_]{0,39}$")
-    id: str = Field(description="cited by methods")
+    id: str = Field(description="id that methods cite")
     tone_curve: ToneCurve
-    background: Literal["black", "environment"] = Field(description="of the truth, where nothing is")
-    source: str = Field(default="", description="command that made it")
+    background: Literal["black", "environment"] = Field(description="content of the truth off surfaces")
+    source: str = Field(default="", description="command that made the suite")
     scenes: dict[Name, SceneEntry] = Field(min_length=1)
 
 
 @dataclass(frozen=True)
 class SuiteScene:
-    """A scene; pictures are read when they are asked for."""
+    """A scene; pictures are read on demand."""
 
     name: str
     folder: Path
@@ -129,12 +129,12 @@ class SuiteScene:
 
     @property
     def kind(self) -> str:
-        """Such as object or table."""
+        """Kind of scene, such as object or table."""
         return self.entry.kind
 
     @property
     def size(self) -> Size:
-        """Of the test cameras."""
+        """Picture size of the test cameras."""
         return Size(self.entry.width, self.entry.height)
 
     @cached_property
@@ -143,29 +143,29 @@ class SuiteScene:
         return cameras_of_transforms(self.folder / TRANSFORMS, self.size)
 
     def light(self, name: str) -> EnvironmentMap:
-        """A light's map."""
+        """Read a light's map."""
         return EnvironmentMap.load(self.folder / LIGHTS / f"{name}.exr")
 
     def truth(self, light: str) -> np.ndarray:
-        """(K, H, W, 3) float32 linear radiance; Fault where it is not known."""
+        """Read true linear radiance (K, H, W, 3) float32; Fault if it is not known."""
         if not self.lights[light].truth:
             raise Fault("missing_light", f"the suite has no truth of {light}", self.folder)
         return self._frames(light, "radiance")
 
     def mask(self) -> np.ndarray | None:
-        """(K, H, W) float32 coverage, if it is known."""
+        """Read coverage (K, H, W) float32, if it is known."""
         return self._frames("mask", "share")[..., 0] if "mask" in self.entry.maps else None
 
     def albedo(self) -> np.ndarray | None:
-        """(K, H, W, 3) float32 linear base color, if it is known."""
+        """Read linear base color (K, H, W, 3) float32, if it is known."""
         return self._frames("albedo", "reflectance") if "albedo" in self.entry.maps else None
 
     def normals(self) -> np.ndarray | None:
-        """(K, H, W, 3) float32, world, zero where nothing is, if they are known."""
+        """Read world normals (K, H, W, 3) float32, zero off surfaces, if they are known."""
         return self._frames("normals", "vector") if "normals" in self.entry.maps else None
 
     def depth(self) -> np.ndarray | None:
-        """(K, H, W) float32 distance along the rays, 0 where nothing is, if it is known."""
+        """Read distance along the rays (K, H, W) float32, 0 off surfaces, if it is known."""
         return self._frames("depth", "distance")[..., 0] if "depth" in self.entry.maps else None
 
     def _frames(self, what: str, values: Values) -> np.ndarray:
@@ -174,7 +174,7 @@ class SuiteScene:
 
 @dataclass(frozen=True)
 class Suite:
-    """A suite's folder, read and checked."""
+    """A suite's folder, checked when read."""
 
     folder: Path
     file: SuiteFile
@@ -182,7 +182,7 @@ class Suite:
 
     @property
     def name(self) -> str:
-        """Such as tron_synth_small."""
+        """Name of the suite, such as tron_synth_small."""
         return self.file.name
 
     @property
@@ -191,15 +191,15 @@ class Suite:
         return self.file.id
 
     def display(self, exposed: np.ndarray) -> np.ndarray:
-        """Exposed linear radiance (..., 3) -> display values in [0, 1], by the suite's tone curve."""
+        """Map exposed linear radiance (..., 3) to display values in [0, 1] by the suite's tone curve."""
         return np.asarray(CURVES[self.file.tone_curve](exposed), np.float32)
 
     @classmethod
     def load(cls, folder: str | Path) -> Suite:
-        """Read suite.yaml and find all that it names.
+        """Read suite.yaml and check all files that it names.
 
         Raises:
-            TronError: no suite, a damaged one, files that are missing, or others than its id was made from.
+            TronError: there is no suite, it is damaged, files are missing, or its files do not match its id.
         """
         folder = Path(folder)
         file = load_yaml(folder / SUITE_NAME, SuiteFile, "give a folder that tron-eval export=SUITE wrote")
@@ -216,7 +216,7 @@ class Suite:
 
 
 def load_yaml(path: Path, model: type[Model], mend: str) -> Model:
-    """A YAML file as a model; TronError where it is missing, damaged or says something else."""
+    """Read a YAML file as a model; TronError if it is missing, damaged or invalid."""
     try:
         if path.stat().st_size > LARGEST_YAML:
             raise TronError(f"{path.name} is too large to be one", path)
@@ -238,7 +238,7 @@ def load_yaml(path: Path, model: type[Model], mend: str) -> Model:
 
 
 def suite_id(name: str, scenes: Iterable[SuiteScene]) -> str:
-    """The name and 12 digits of a hash of all scenes' names, lights, exposures, cameras and truth."""
+    """Return the name and 12 digits of a hash of all scenes' names, lights, exposures, cameras and truth."""
     digest = hashlib.sha256()
     for scene in sorted(scenes, key=lambda each: each.name):
         digest.update(f"{scene.name} {scene.entry.model_dump_json()}\n".encode())
@@ -268,15 +268,15 @@ def _require_whole(scene: SuiteScene, root: Path) -> None:
 
 @dataclass(frozen=True)
 class NewScene:
-    """A scene to be written.
+    """A scene to write.
 
     Attributes:
         name, kind: as in suite.yaml.
-        write_train: writes the training views' capture folder at a path.
+        write_train: function that writes the training views' capture folder at a path.
         train_light: light of the training views, if it is known.
-        cameras: of test.
+        cameras: test cameras.
         lights: name -> map, exposure, family, and truth (K, H, W, 3) or None.
-        maps: of MAPS, (K, H, W, C).
+        maps: name in MAPS -> (K, H, W, C).
     """
 
     name: str
@@ -296,10 +296,10 @@ def write_suite(
     background: Literal["black", "environment"] = "black",
     source: str = "",
 ) -> Suite:
-    """Write a suite, whole or not at all, one scene in memory at a time, and read it back.
+    """Write a suite whole or not at all, with one scene in memory at a time, and read it back.
 
     Raises:
-        TronError: the folder holds something, or cannot be written.
+        TronError: the folder is not empty, or cannot be written.
     """
     require_new(folder)
     with atomic_folder(folder) as made:
@@ -322,13 +322,13 @@ def write_suite(
 
 
 def require_new(folder: Path) -> None:
-    """TronError where a folder holds anything."""
+    """Raise TronError if a folder is not empty."""
     if folder.exists() and any(folder.iterdir()):
         raise TronError("folder is not empty", folder, "choose another output_dir for the suite")
 
 
 def write_yaml(path: Path, model: BaseModel) -> None:
-    """Write a model as YAML, plainly."""
+    """Write a model as plain YAML."""
     path.write_text(
         yaml.safe_dump(model.model_dump(mode="json"), sort_keys=False, allow_unicode=True), "utf-8"
     )
@@ -363,7 +363,7 @@ def _write_scene(folder: Path, scene: NewScene) -> SceneEntry:
 
 
 def transforms(cameras: Sequence[Camera]) -> dict[str, object]:
-    """Cameras as a nerfstudio transforms.json without pictures; TronError where they differ in size."""
+    """Return cameras as a nerfstudio transforms.json without pictures; TronError if their sizes differ."""
     if len({(camera.width, camera.height) for camera in cameras}) != 1:
         raise TronError("test cameras differ in size", mend="give those of one size")
     lenses = [

@@ -1,1 +1,1 @@
-"""Benchmark `reconstruction`: reconstructions, their lights, optimisation steps."""
+"""Benchmark `reconstruction`: surfels from photos, fitted lights, relighting and speed."""

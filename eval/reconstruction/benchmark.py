@@ -1,4 +1,4 @@
-"""Benchmark `reconstruction`: how good surfels from photos are, and how long they take."""
+"""Benchmark `reconstruction`: quality of surfels from photos, and time to make them."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ Name = Annotated[str, Field(pattern=r"^[a-z][a-z0-9_]*$")]
 
 
 class Made(NamedTuple):
-    """Files that a command left of one scene, and its wall seconds."""
+    """Files that a command wrote for one scene, and its wall time in seconds."""
 
     scene: str
     way: str
@@ -49,56 +49,60 @@ class Made(NamedTuple):
 
 
 def scene_names(dataset: Path) -> list[str]:
-    """Names of the captures in a folder of tron-datagen."""
+    """Return the names of the captures in a folder of tron-datagen."""
     return sorted(path.parent.name for path in (dataset / "captures").glob("*/transforms.json"))
 
 
 def relit_truths(dataset: Path, scene: str) -> list[Path]:
-    """Folders of a scene's held-out views under other lights."""
+    """Return the folders of a scene's held-out views under other lights."""
     return sorted(path.parent for path in (dataset / "relit").glob(f"{scene}_*/transforms.json"))
 
 
 class SplatSettings(BaseModel):
-    """A scan of the first scene as other programs leave it, and what tron-reconstruct makes of that."""
+    """Settings: a scan of the first scene in the form of other programs, and its reconstruction."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    scan: list[str] = Field(description="arguments of tron-reconstruct for what becomes the scan")
-    reconstruct: list[str] = Field(description="arguments of tron-reconstruct for the scan as a capture")
+    scan: list[str] = Field(description="arguments of tron-reconstruct that make the scan")
+    reconstruct: list[str] = Field(description="arguments of tron-reconstruct with the scan as capture")
     photographs: list[str] = Field(
-        description="arguments of tron-datagen, which makes photographs for a thick scan, and relights them"
+        description="arguments of tron-datagen that make photographs for a thick scan and relight them"
     )
     thick: list[str] = Field(
-        description="arguments of tron-reconstruct for what becomes a thick scan, of these photographs"
+        description="arguments of tron-reconstruct that make a thick scan of these photographs"
     )
-    carry: list[str] = Field(description="those for the thick scan as a capture, whose surfels stay")
+    carry: list[str] = Field(
+        description="arguments of tron-reconstruct with the thick scan as capture; its surfels stay"
+    )
 
 
 class Reconstruction(Benchmark):
-    """Parts of the benchmark, and the arguments of the commands."""
+    """Settings: parts of the benchmark, and arguments of its commands."""
 
     name: ClassVar[str] = "reconstruction"
 
     variant: str = Field(default=DEFAULT_VARIANT, description="Mitsuba variant; cuda_ad_rgb on a GPU")
     seed: int = 0
-    parts: list[Part] = Field(description="what is measured", min_length=1)
-    datagen: list[str] = Field(description="arguments of tron-datagen, which makes the captures")
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
+    datagen: list[str] = Field(description="arguments of tron-datagen that make the captures")
     reconstruct: list[str] = Field(description="arguments of tron-reconstruct for every scene and way")
-    ways: dict[Name, list[str]] = Field(description="further ones of each way; the first is the main one")
+    ways: dict[Name, list[str]] = Field(
+        description="way -> further arguments of tron-reconstruct; the first way is the main one"
+    )
     photographs: list[str] = Field(
-        description="arguments of tron-datagen, which makes the same scenes as photographs, and relights them"
+        description="arguments of tron-datagen that make the same scenes as photographs and relight them"
     )
     photos: dict[Name, list[str]] = Field(
-        description="further arguments of each way to reconstruct the photographs, none of which is a way's"
+        description="way -> further arguments to reconstruct the photographs; names are not in ways"
     )
-    relit: list[Name] = Field(description="ways whose surfels are relit, beside those of photographs")
-    splats: SplatSettings = Field(description="scans of plain splats, made and taken as captures")
-    real_data: Path | None = Field(description="folder with captures/fox and hdri; null: no fox")
-    fox_downscale: PositiveFloat = Field(default=4, description="factor by which the photos are reduced")
+    relit: list[Name] = Field(description="ways to relight, besides all ways of the photographs")
+    splats: SplatSettings = Field(description="settings of scans of plain splats, used as captures")
+    real_data: Path | None = Field(default=None, description="folder with captures/fox, hdri; null: no fox")
+    fox_downscale: PositiveFloat = Field(default=4, description="downsampling factor of the photos")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
-    hdris: list[str] = Field(description="files of hdri under which the fox is relit")
+    hdris: list[str] = Field(description="files of real_data/hdri that relight the fox")
     relight: list[str] = Field(description="arguments of tron-relight")
-    relit_views: PositiveInt = Field(default=3, description="held-out views of the fox that are shown")
+    relit_views: PositiveInt = Field(default=3, description="number of held-out views of the fox on the page")
 
     def check(self) -> None:
         """Find the commands that the parts call."""
@@ -111,7 +115,7 @@ class Reconstruction(Benchmark):
             script_path(name)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Run the commands that are not finished, one after the other; then score, picture and time.
+        """Run the unfinished commands one by one; then add scores, pictures and times.
 
         Raises:
             StageFailed: a command failed; what was finished before it is kept and is not redone.
@@ -138,19 +142,19 @@ class Reconstruction(Benchmark):
         return found
 
     def _variant(self) -> list[str]:
-        """The variant as an argument of a command, if it is not the default."""
+        """Return the variant as an argument of a command, if it is not the default."""
         return [] if self.variant == DEFAULT_VARIANT else [f"variant={self.variant}"]
 
     def _prefix(self, way: str) -> str:
-        """Beginning of the metrics of a way: the first one's name no way."""
+        """Return the prefix of a way's metrics; the first way has none."""
         return "reconstruction" if way == next(iter(self.ways)) else f"reconstruction.{way}"
 
     def _reconstruct_scenes(self, stages: Stages, folder: Path) -> list[Made]:
-        """Every scene in every way."""
+        """Reconstruct every scene in every way."""
         return self._reconstruct_all(stages, folder, self._dataset(stages, folder), self.ways)
 
     def _reconstruct_photos(self, stages: Stages, folder: Path) -> list[Made]:
-        """The same scenes from photographs, without any prior."""
+        """Reconstruct the same scenes from photographs, without any prior."""
         return self._reconstruct_all(stages, folder, self._photographs(stages, folder), self.photos)
 
     def _dataset(self, stages: Stages, folder: Path) -> Path:
@@ -159,7 +163,7 @@ class Reconstruction(Benchmark):
         return dataset
 
     def _photographs(self, stages: Stages, folder: Path) -> Path:
-        """Captures of photographs, and their held-out views under other lights."""
+        """Make captures of photographs, and their held-out views under other lights."""
         dataset = folder / PHOTOGRAPHS
         arguments = [*self.photographs, f"output_dir={dataset}"]
         stages.run("photographs", [Child("photographs", "tron-datagen", arguments)])
@@ -182,7 +186,7 @@ class Reconstruction(Benchmark):
         return Made(scene, way, capture, out, seconds)
 
     def _reconstruct_splats(self, stages: Stages, folder: Path) -> list[Made]:
-        """A scan of the first scene, raw and reconstructed."""
+        """Score a scan of the first scene, raw and reconstructed."""
         from eval.reconstruction.scans import write_scan
         from tron.gaussians.scene import GaussianScene
 
@@ -200,7 +204,7 @@ class Reconstruction(Benchmark):
         return made
 
     def _reconstruct_thick(self, stages: Stages, folder: Path) -> list[Made]:
-        """A thick scan of the first scene of photographs of its own, as it is and with materials."""
+        """Score a thick scan, made from photographs of its own, as it is and with materials."""
         from eval.reconstruction.scans import write_scan
         from tron.gaussians.scene import GaussianScene
         from tron.scans.camera_files import CAMERAS
@@ -226,7 +230,7 @@ class Reconstruction(Benchmark):
     def _run(
         self, stages: Stages, label: str, capture: Path, arguments: list[str], output_dir: Path
     ) -> float:
-        """Reconstruct one capture; its wall seconds."""
+        """Reconstruct one capture; return the wall time in seconds."""
         typed = [f"capture={capture}", *arguments, *self._variant()]
         typed += [f"seed={self.seed}", f"output_dir={output_dir}"]
         return stages.run(label, [Child(label, "tron-reconstruct", typed)])
@@ -295,10 +299,10 @@ class Reconstruction(Benchmark):
             found.show("fox", name, group)
 
     def _reconstruct_fox(self, stages: Stages, folder: Path) -> FoxRun | None:
-        """Reconstruct and relight the fox; None, with a warning, if it is not there."""
+        """Reconstruct and relight the fox; None, with a warning, if its photos are missing."""
         data = self.real_data
         if data is None or not (data / "captures" / "fox").is_dir():
-            log.warning("the fox is left out: no captures/fox in benchmark.real_data=%s", data)
+            log.warning("no fox: give benchmark.real_data=FOLDER with captures/fox and hdri")
             return None
         capture, out, cameras = data / "captures" / "fox", folder / "fox", folder / "fox_cameras.json"
         arguments = [f"downscale={self.fox_downscale:g}", *self.fox]

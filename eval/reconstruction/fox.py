@@ -1,4 +1,4 @@
-"""The fox, a real capture: figures, and pictures as photographed, reconstructed and relit."""
+"""The fox, a real capture: figures, and pictures of its photos, its surfels and relit frames."""
 
 from __future__ import annotations
 
@@ -25,15 +25,15 @@ from tron.storage import write_atomic
 
 @dataclass(frozen=True)
 class Fox:
-    """The real capture as it was photographed, reconstructed and relit.
+    """Photos, reconstruction and relit frames of the real capture.
 
     Attributes:
-        run: the reconstruction.
+        run: run of tron-reconstruct.
         photos: name of a held-out view -> (H, W, 3) display values.
         rendered: name -> channel -> (H, W, 3) display values, of the surfels.
         relit: name of a light -> its picture, then one picture a view.
         relit_seconds: of all the lights together.
-        light: picture of the fitted light, if one was fitted.
+        light: picture of the fitted light, if any.
     """
 
     run: Run
@@ -44,7 +44,7 @@ class Fox:
     light: np.ndarray | None
 
     def rows(self) -> Iterator[Row]:
-        """Figures of the reconstruction, and the time of relighting it."""
+        """Yield figures of the reconstruction, and the time to relight it."""
         report = self.run.report
         for name, key, unit in (("test_psnr", "psnr", "dB"), ("ssim", "ssim", "1"), ("lpips", "lpips", "1")):
             if key in report.test:
@@ -64,7 +64,7 @@ class Fox:
             yield Row(metric="fox.relight_seconds", value=self.relit_seconds, unit="s", n=len(self.relit))
 
     def pictures(self) -> Iterator[tuple[str, Pictures]]:
-        """Groups with the names of their files: held-out photos beside the surfels, and every other light."""
+        """Yield file name -> group: held-out photos beside the surfels, and a group for each other light."""
         for name, photo in self.photos.items():
             psnr = self.run.report.views.get(name, {}).get("psnr")
             pictures = [Picture(photo, "photo", f"held-out photo {name} of the fox")]
@@ -87,12 +87,12 @@ class Fox:
 
 @dataclass
 class FoxRun:
-    """Files that the commands left of the fox.
+    """Files that the commands wrote for the fox.
 
     Attributes:
-        capture: what was read.
-        folder: what tron-reconstruct wrote.
-        seconds: its wall time.
+        capture: input of tron-reconstruct.
+        folder: output of tron-reconstruct.
+        seconds: wall time of tron-reconstruct.
         views: the held-out views that are shown.
         lights: name of a light -> (map, folder of tron-relight's frames).
         relit_seconds: wall time of all the lights together.
@@ -107,21 +107,21 @@ class FoxRun:
 
 
 def chosen_views(capture: Path, downscale: float, count: int) -> list[View]:
-    """``count`` of the held-out views, evenly spread, as tron-reconstruct loads them."""
+    """Return ``count`` held-out views, evenly spread, as tron-reconstruct loads them."""
     views = load_capture(capture, LoadSettings(downscale=downscale)).test_views
     places = np.unique(np.linspace(0, len(views) - 1, min(count, len(views))).round().astype(int))
     return [views[place] for place in places]
 
 
 def write_cameras(path: Path, views: Sequence[View]) -> None:
-    """The views' cameras as tron-relight's ``cameras=`` takes them; a file that says so already stays."""
+    """Write the views' cameras for tron-relight's ``cameras=``; a file with this content is left alone."""
     text = json.dumps([view.camera.to_dict() for view in views], indent=1) + "\n"
     if not path.is_file() or path.read_text("utf-8") != text:
         write_atomic(path, text)
 
 
 def collect_fox(made: FoxRun) -> Fox:
-    """Figures and pictures of the finished commands."""
+    """Return figures and pictures of the finished commands."""
     fitted = read_light(made.folder)
     return Fox(
         run=collect_run("fox", made.folder, made.capture, made.seconds),
@@ -137,7 +137,7 @@ def collect_fox(made: FoxRun) -> Fox:
 
 
 def relit_frames(folder: Path, frames: int) -> list[np.ndarray]:
-    """Frames of tron-relight as pictures, display values: ``lit``, through its exposure and AgX."""
+    """Return frames of tron-relight in display values: ``lit`` after its exposure and AgX."""
     path = folder / "relight.json"
     try:
         exposure = float(json.loads(path.read_text("utf-8"))["exposure"])

@@ -1,7 +1,7 @@
-"""Error of a fitted light, by the irradiance that it and the true one give to surfaces of all normals.
+"""Error of a fitted light: its irradiance on surfaces of all normals against the true light's irradiance.
 
-Irradiance and not radiance is compared: it is what lights diffuse surfaces and all that the fit was given,
-while a pixel of the map that only a mirror could tell from its neighbour is nobody's error.
+Irradiance is compared, not radiance: it lights diffuse surfaces and is all that the fit saw. Differences
+between neighbouring pixels of the map that only a mirror would show do not count.
 """
 
 from __future__ import annotations
@@ -24,7 +24,7 @@ HEIGHT = 96
 
 
 def irradiance(lights: Sequence[EnvironmentMap], normals: np.ndarray) -> list[np.ndarray]:
-    """Irradiance / pi under each light on unoccluded surfaces of unit ``normals`` (N, 3): sums over texels.
+    """Return irradiance / pi under each light on unoccluded surfaces of unit ``normals`` (N, 3), from texels.
 
     Returns:
         (N, 3) float64 for each light.
@@ -36,14 +36,14 @@ def irradiance(lights: Sequence[EnvironmentMap], normals: np.ndarray) -> list[np
 
 
 def texels(light: EnvironmentMap) -> tuple[np.ndarray, np.ndarray]:
-    """Unit directions (H W, 3) of a baked map's texels, row by row, and their solid angles (H W,)."""
+    """Return unit directions (H W, 3) of a baked map's texels, row by row, and their solid angles (H W,)."""
     return light.directions().reshape(-1, 3), np.repeat(light.solid_angles(), light.image.shape[1])
 
 
 def brightest_direction(light: EnvironmentMap) -> np.ndarray:
-    """(3,) unit direction of the light's brightest spot: where a cone of SPOT_DEG holds the most light.
+    """Return the unit direction (3,) of the brightest spot: centre of the light in the cone with most light.
 
-    The centre of that light, not of the cone, so that it is finer than a texel.
+    The centre of the light in the cone, not of the cone, is finer than a texel.
     """
     small = light.baked().resized(SPOT_HEIGHT)
     directions, solid_angles = texels(small)
@@ -55,16 +55,16 @@ def brightest_direction(light: EnvironmentMap) -> np.ndarray:
 
 
 def sun_error_deg(found: EnvironmentMap, truth: EnvironmentMap) -> float:
-    """Angle between the brightest spots of two lights, degrees."""
+    """Return the angle between the brightest spots of two lights, degrees."""
     a, b = brightest_direction(found), brightest_direction(truth)
     return float(np.degrees(np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b)))
 
 
 def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, float]:
-    """Relative L2 errors of irradiance over normals drawn evenly on the sphere.
+    """Return relative L2 errors of irradiance over normals drawn evenly on the sphere.
 
-    ``irradiance_error`` as it is; ``scaled_error`` after the one factor that makes it least, which
-    leaves what is wrong with colour and direction.
+    ``irradiance_error`` is without a factor; ``scaled_error`` is after the best factor, and so measures
+    errors of colour and direction only.
     """
     normals = generator(0, "reconstruction", "light normals").normal(size=(NORMALS, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
@@ -79,6 +79,6 @@ def light_errors(found: EnvironmentMap, truth: EnvironmentMap) -> dict[str, floa
 
 
 def read_light(folder: Path) -> EnvironmentMap | None:
-    """The light of a capture or of a reconstruction; None if it has none."""
+    """Read the light of a capture or of a reconstruction; None if it has none."""
     path = folder / "environment.exr"
     return EnvironmentMap.load(path) if path.is_file() else None

@@ -23,10 +23,10 @@ LIGHT_HEIGHT = 64
 
 
 def compare_scene(runs: Mapping[str, Run], titles: Mapping[str, str]) -> Pictures:
-    """The middle held-out view of a scene: the truth, and a row for each way that reconstructed it.
+    """Show the middle held-out view of a scene: the truth, and a row for each way of reconstruction.
 
     Args:
-        runs: way -> its run. titles: way -> what it is.
+        runs: way -> its run. titles: way -> its title.
     """
     run = next(iter(runs.values()))
     views = read_capture_folder(run.capture).test_views
@@ -62,9 +62,9 @@ def compare_scene(runs: Mapping[str, Run], titles: Mapping[str, str]) -> Picture
 
 
 def show_view(folder: Path, view: View, mask: np.ndarray | None = None) -> dict[str, np.ndarray]:
-    """Surfels of a reconstruction from a view: channel -> (H, W, 3) display values.
+    """Render surfels of a reconstruction from a view: channel -> (H, W, 3) display values.
 
-    Base color is scaled to the view's within ``mask`` (H, W), as its figure is, where there is one.
+    If there is a ``mask`` (H, W), base color is scaled to the view's base color in it, as for its figure.
     """
     buffers = SurfelTracer(GaussianScene.load(folder / "scene.ply")).gbuffer(view.camera).numpy()
     solid = buffers["opacity"] > 0.5
@@ -79,12 +79,12 @@ def show_view(folder: Path, view: View, mask: np.ndarray | None = None) -> dict[
 
 
 def light_picture(light: EnvironmentMap, exposure: float | None = None) -> np.ndarray:
-    """A light as a small lat-long picture, (H, 2 H, 3) display values, by its own exposure unless given."""
+    """Return a light as a small lat-long picture, (H, 2 H, 3) display values; default: its own exposure."""
     return to_display(light.baked().resized(LIGHT_HEIGHT).image, exposure or light.exposure())
 
 
 def normal_picture(normal: np.ndarray, where: np.ndarray) -> np.ndarray:
-    """World normals (H, W, 3) as colours, black outside of ``where`` (H, W)."""
+    """Return world normals (H, W, 3) as colours, black outside ``where`` (H, W)."""
     return np.where(where[..., None], np.clip(0.5 * normal + 0.5, 0, 1), 0)
 
 

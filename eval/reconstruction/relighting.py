@@ -1,9 +1,8 @@
 """A reconstruction under lights that its photos never saw, against Mitsuba's path tracer.
 
-What the surfels are for. Held-out views are lit as tron-relight's final quality lights them (``lit``), and
-held against path-traced ones where these show nothing but surfaces. Photos alone do not tell bright paint in
-dim light from dim paint in bright light: one factor on all light of a scene is found that brings both
-nearest.
+Held-out views are lit as by tron-relight's final quality (``lit``), and compared with path-traced views in
+pixels that show only surfaces. Photos alone cannot distinguish bright paint in dim light from dim paint in
+bright light, so one factor on all light of a scene is fitted first.
 """
 
 from __future__ import annotations
@@ -36,7 +35,7 @@ class RelitLight:
     Attributes:
         psnr: mean over the views, dB, on surfaces, display values.
         truth: the middle view path-traced, (H, W, 3) display values.
-        shown: the same of the surfels, after the factor.
+        shown: the same view of the surfels, after the factor.
     """
 
     psnr: float
@@ -46,10 +45,10 @@ class RelitLight:
 
 @dataclass(frozen=True)
 class Relit:
-    """A reconstruction under all its other lights.
+    """Scores of a reconstruction under all its other lights.
 
     Attributes:
-        lights: name of a light, such as "sun" -> what was found.
+        lights: name of a light, such as "sun" -> its scores.
         factor: on the surfels' radiance, one for all lights and views.
     """
 
@@ -58,12 +57,12 @@ class Relit:
 
     @property
     def psnr(self) -> float:
-        """Mean over the lights, dB."""
+        """Mean PSNR over the lights, dB."""
         return float(np.mean([light.psnr for light in self.lights.values()]))
 
 
 def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALITY["final"]) -> Relit:
-    """Light surfels as the path-traced views were lit, and score them.
+    """Light surfels by the lights of the path-traced views, and score the pictures.
 
     Args:
         scene: scene.ply, in the world of the views.
@@ -94,24 +93,24 @@ def relight(scene: Path, truths: Sequence[Path], estimation: Estimation = QUALIT
 
 
 def relit_frames(light: Illumination, capture: Capture) -> list[Guidance]:
-    """The surfels from the capture's views."""
+    """Return the surfels' frames from the capture's views."""
     seeds = [integer(0, "reconstruction", "relit", number) for number in range(len(capture.views))]
     return [light.render(view.camera, seed) for view, seed in zip(capture.views, seeds, strict=True)]
 
 
 def _lit_views(light: Illumination, capture: Capture) -> np.ndarray:
-    """(K, H, W, 3) linear radiance of the surfels from the capture's views."""
+    """Return linear radiance (K, H, W, 3) of the surfels from the capture's views."""
     return np.stack([frame.lit for frame in relit_frames(light, capture)])
 
 
 def display(capture: Capture) -> tuple[np.ndarray, np.ndarray]:
-    """True display values (K, H, W, 3), and where nothing but surfaces is seen (K, H, W) bool."""
+    """Return true display values (K, H, W, 3), and the mask of pixels that show only surfaces (K, H, W)."""
     truth = np.stack([to_display(view.read(), capture.exposure) for view in capture.views])
     return truth, np.stack([view.read("mask") > COVERED for view in capture.views])
 
 
 def relit_pictures(title: str, relit: Mapping[str, Relit]) -> Pictures:
-    """A row of pictures for each light: the truth, then every way; ``relit``: title -> what it gave."""
+    """Return a row of pictures for each light: the truth, then every way; ``relit``: title -> scores."""
     pictures = []
     for light, under in next(iter(relit.values())).lights.items():
         pictures.append(

@@ -1,4 +1,4 @@
-"""One run of tron-reconstruct: its metrics.json, read and checked, and the time it took."""
+"""One run of tron-reconstruct: its checked metrics.json and its wall time."""
 
 from __future__ import annotations
 
@@ -39,7 +39,7 @@ class _Part(BaseModel):
 
 
 class Point(_Part):
-    """Held-out quality under way: dB after so many seconds of training."""
+    """Held-out quality during training: dB after so many seconds."""
 
     step: int
     seconds: FiniteFloat
@@ -47,14 +47,14 @@ class Point(_Part):
 
 
 class Seconds(_Part):
-    """Seconds of the parts of a run."""
+    """Seconds of each part of a run."""
 
     surfels: FiniteFloat
     light: FiniteFloat = 0.0
 
 
 class Views(_Part):
-    """Which views there were."""
+    """Views of a run."""
 
     views: int
     held_out: list[str]
@@ -62,7 +62,7 @@ class Views(_Part):
 
 
 class Report(_Part):
-    """metrics.json."""
+    """Contents of metrics.json."""
 
     capture: Views
     surfels: int
@@ -79,13 +79,13 @@ class Run:
 
     Attributes:
         name: of the scene.
-        folder: what the command wrote.
-        capture: what it read.
+        folder: output of the command.
+        capture: input of the command.
         report: its metrics.json.
         seconds: wall time of the command from start to end.
-        light: figures of its light against the true one, name -> value; empty where either is unknown.
+        light: figure -> error of its light against the true light; empty if either is unknown.
         family: of the true light, such as "sun"; empty if unknown.
-        relit: the surfels under other lights; None where that was not measured.
+        relit: scores under other lights; None if not measured.
     """
 
     name: str
@@ -99,7 +99,7 @@ class Run:
 
 
 def read_report(folder: Path) -> Report:
-    """metrics.json of a finished run; TronError if it is missing, or is none."""
+    """Read metrics.json of a finished run; TronError if it is missing or invalid."""
     path = folder / "metrics.json"
     try:
         return Report.model_validate_json(path.read_bytes())
@@ -114,7 +114,7 @@ def read_report(folder: Path) -> Report:
 
 
 def collect_run(name: str, folder: Path, capture: Path, seconds: float) -> Run:
-    """A finished reconstruction; its light is held against the capture's where both are known."""
+    """Collect a finished reconstruction; compare its light with the capture's if both are known."""
     found, truth, family = read_light(folder), read_light(capture), light_family(capture)
     light = {}
     if found is not None and truth is not None:
@@ -125,7 +125,7 @@ def collect_run(name: str, folder: Path, capture: Path, seconds: float) -> Run:
 
 
 def light_family(capture: Path) -> str:
-    """Family of a path-traced capture's light, from its spec.json; empty where none says so."""
+    """Return the family of a path-traced capture's light from its spec.json; empty if unknown."""
     try:
         return str(json.loads((capture / "spec.json").read_text("utf-8"))["lights"][0]["family"])
     except (OSError, ValueError, LookupError, TypeError):
@@ -133,11 +133,11 @@ def light_family(capture: Path) -> str:
 
 
 def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Means over the scenes with intervals, then every scene's own figures.
+    """Yield means over the scenes with intervals, then the figures of every scene.
 
-    Of seconds and surfels it is the most, which has no interval. A figure that a scene lacks has no row for
-    it, and no mean, which would be of other scenes than its neighbours are. ``seed`` draws the scenes of the
-    intervals.
+    For seconds and surfels, the maximum replaces the mean and has no interval. A figure that any scene lacks
+    has no mean, because the mean would be over other scenes than its neighbours. ``seed`` draws the scenes of
+    the intervals.
     """
     for metric, unit, values in _figures(runs):
         if len(values) == len(runs):
@@ -154,9 +154,9 @@ def rows_of(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
 
 
 def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]:
-    """Errors of irradiance after one factor, of all scenes and by kind of light, and of the sun's direction.
+    """Yield errors of irradiance after one factor, overall and by kind of light, and of sun directions.
 
-    Light is soft where it is no sun's: a disk in the sky is another task than a glow.
+    All lights without a sun are soft: finding a disk in the sky is another task than finding a glow.
     """
     lit = [run for run in runs if run.light]
     sunny = [run for run in lit if run.family == SUN]
@@ -175,7 +175,7 @@ def light_rows(prefix: str, runs: Sequence[Run], seed: int = 0) -> Iterator[Row]
 
 
 def mean_curve(runs: Sequence[Run]) -> list[tuple[float, float]]:
-    """Mean (seconds, dB of held-out views) over the scenes at the steps that all of them scored."""
+    """Return mean (seconds, dB of held-out views) over the scenes at steps that all scenes scored."""
     by_step = [{point.step: point for point in run.report.curve} for run in runs]
     steps = sorted(set.intersection(*(set(points) for points in by_step)))
     if len(steps) < 2:
@@ -185,7 +185,7 @@ def mean_curve(runs: Sequence[Run]) -> list[tuple[float, float]]:
 
 
 def _figures(runs: Sequence[Run]) -> Iterator[tuple[str, str, dict[str, float]]]:
-    """Metric, unit, scene -> value."""
+    """Yield metric, unit, and scene -> value."""
     for key, (metric, unit) in FIGURES.items():
         values = {run.name: run.report.test[key] for run in runs if key in run.report.test}
         if values:

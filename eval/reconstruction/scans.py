@@ -1,8 +1,8 @@
-"""Scans as other programs leave them: plain 3DGS files of known scenes, and how good their surfaces are.
+"""Scans in the form of other programs: plain 3DGS files of known scenes, and errors of their surfaces.
 
-A file of 3DGS has positions, radiance, opacity, three scales and a rotation. Which of its axes is a normal,
-on which side the surface lies and what it is made of nobody wrote down; so that nothing of that is handed
-over by the order of our arrays, axes are exchanged and turned over at random.
+A 3DGS file has positions, radiance, opacity, three scales and a rotation. It does not say which axis is the
+normal, which side is the front, or what the material is. Axes are permuted and flipped at random, so that the
+order of our arrays does not reveal it either.
 """
 
 from __future__ import annotations
@@ -33,15 +33,15 @@ THICKNESS = 0.3
 
 @dataclass(frozen=True)
 class Scan:
-    """Surfaces of one scan, against the truth of the scene that it is of.
+    """Errors of a scan's surfaces against its true scene.
 
     Attributes:
-        name: of the scene.
-        normals: figures of the held-out views' normals by name, degrees: ``normal_mae_deg`` and
+        name: name of the scene.
+        normals: errors of normals in the held-out views, degrees: ``normal_mae_deg`` and
             ``normal_median_deg``, means over the views.
         surfels: their number.
         seconds: wall time of the command that made it.
-        relit: under other lights.
+        relit: scores under other lights.
         views: normals of the middle held-out view: (truth, found), (H, W, 3) display values.
     """
 
@@ -54,7 +54,7 @@ class Scan:
 
 
 def write_scan(path: Path, scene: GaussianScene, seed: int) -> None:
-    """Write a scene as a plain 3DGS PLY: no materials, no comments, normals nobody can read off.
+    """Write a scene as a plain 3DGS PLY without materials, comments or recoverable normals.
 
     The kernel of such files is of degree 2, so the scene's must be.
     """
@@ -84,11 +84,11 @@ def collect_scan(name: str, scene: Path, capture: Path, truths: Sequence[Path], 
     """Score the surfaces of a scan.
 
     Args:
-        name: of the path-traced scene.
-        scene: the surfels, in its world.
-        capture: path-traced views of it with true normals.
-        truths: the same under other lights, see :func:`relight`.
-        seconds: that making it took.
+        name: name of the path-traced scene.
+        scene: the surfels, in the world of the capture.
+        capture: path-traced views with true normals.
+        truths: the views under other lights, see :func:`relight`.
+        seconds: time to make the scan.
     """
     surfels, views = GaussianScene.load(scene), read_capture_folder(capture).test_views
     relighter = Relighter(surfels)
@@ -110,7 +110,7 @@ def collect_scan(name: str, scene: Path, capture: Path, truths: Sequence[Path], 
 
 
 def scan_rows(way: str, scans: Sequence[Scan], seed: int = 0) -> Iterator[Row]:
-    """Means over the scans: ``splats.*`` of those made anew, ``splats.raw.*`` of the files as they are."""
+    """Yield means over the scans: ``splats.*`` reconstructed, ``splats.raw.*`` for the files as they are."""
     prefix = "splats" if way == "splats" else f"splats.{way}"
     for figure in ("normal_mae_deg", "normal_median_deg"):
         yield mean_row(
@@ -122,7 +122,7 @@ def scan_rows(way: str, scans: Sequence[Scan], seed: int = 0) -> Iterator[Row]:
 
 
 def normal_pictures(scans: Mapping[str, Scan]) -> Pictures:
-    """True normals of a scene, and those of its scans by their titles."""
+    """Show the true normals of a scene, and the normals of its scans by title."""
     first = next(iter(scans.values()))
     pictures = [Picture(first.views[0], "true normals", f"true normals of scene {first.name}", strong=True)]
     for title, scan in scans.items():

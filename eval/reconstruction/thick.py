@@ -1,7 +1,7 @@
-"""Thick scans relit: the file as it is, through a proxy and without, and with the materials carried to it.
+"""Relight thick scans: the file as it is, with and without a proxy, and with materials carried to it.
 
-Shadows are judged where it is known what arrives: specks are pixels that truly get over 90 % of their light
-and show less than half of it, leaks are those that truly get less than a quarter and show more than half.
+Shadows are judged where the true visibility is known: specks are pixels that should get over 90 % of their
+light and show less than half; leaks are pixels that should get less than a quarter and show more than half.
 """
 
 from __future__ import annotations
@@ -45,12 +45,12 @@ GAINS = {
 
 
 def collect_thick(way: str, folder: Path, capture: Path, truths: Sequence[Path]) -> dict[str, float]:
-    """Figures of a scan by name, those of :func:`relit_figures`, base color and the light that was found.
+    """Return figures of a scan by name: from :func:`relit_figures`, of base color and of the fitted light.
 
     Args:
         way: of PROXY.
-        folder: with scene.ply, and environment.exr where a light was found.
-        capture: of the photographs, with the true maps of its held-out views.
+        folder: has scene.ply, and environment.exr if a light was fitted.
+        capture: capture of the photographs, with true maps of its held-out views.
         truths: the held-out views under other lights (``tron-datagen``'s relit/NAME_1_sun).
     """
     scene, photographed = GaussianScene.load(folder / "scene.ply"), read_capture_folder(capture)
@@ -66,13 +66,13 @@ def collect_thick(way: str, folder: Path, capture: Path, truths: Sequence[Path])
 
 
 def relit_figures(relighter: Relighter, views: Sequence[View], truths: Sequence[Path]) -> dict[str, float]:
-    """Means over the lights of ``relight_psnr`` and ``irradiance_psnr`` (dB), and shares of pixels.
+    """Return means over lights of ``relight_psnr`` and ``irradiance_psnr`` (dB), and shares of pixels.
 
-    Those are ``specks``, ``leaks`` (see the module) and ``half``, which get less than half of their light.
+    The shares are ``specks``, ``leaks`` (see the module) and ``half``: pixels below half of their light.
 
     Args:
         relighter: the scan.
-        views: the true normals of what is seen.
+        views: views with true normals.
         truths: path-traced views of the same cameras, each folder under one light.
     """
     pictures, found = [], []
@@ -95,9 +95,9 @@ def relit_figures(relighter: Relighter, views: Sequence[View], truths: Sequence[
 
 
 def thick_rows(ways: Mapping[str, Mapping[str, float]]) -> Iterator[Row]:
-    """``splats.thick.*`` of the carried scan, ``raw_*`` and ``raw_today_*`` of the file, and what is gained.
+    """Yield rows ``splats.thick.*``: the carried scan, the file (``raw_*``, ``raw_today_*``), and the gain.
 
-    ``ways`` are those of PROXY, and what :func:`collect_thick` found.
+    ``ways`` are keys of PROXY -> figures by :func:`collect_thick`.
     """
     for way, figures in ways.items():
         for name, value in figures.items():
@@ -114,7 +114,7 @@ def thick_rows(ways: Mapping[str, Mapping[str, float]]) -> Iterator[Row]:
 def _of_shadows(
     frame: Guidance, view: View, normal: np.ndarray, light: EnvironmentMap, exposure: float
 ) -> Iterator[tuple[str, float]]:
-    """Figures of a frame whose true normals (H, W, 3) are known."""
+    """Yield the shadow figures of a frame with known true normals (H, W, 3)."""
     where = (view.read("mask") == 1) & normal.any(axis=-1)
     arrived, shown, of = view.read("irradiance"), frame["irradiance"], frame["unshadowed"]
     (open_,) = irradiance([light], normal[where])
@@ -134,7 +134,7 @@ def _of_shadows(
 
 
 def _base_color_psnr(scene: GaussianScene, views: Sequence[View]) -> float:
-    """Mean over the views, dB, after one factor for each view and channel."""
+    """Return the mean base color PSNR over the views, dB, after one factor per view and channel."""
     tracer, psnrs = SurfelTracer(scene), []
     for view in views:
         truth, subject = view.read("base_color"), view.read("mask") == 1

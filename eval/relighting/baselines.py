@@ -5,8 +5,8 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 
 - ``pbr``: D(B).
 - ``pbr_x_irradiance``: D(o s B e E + (1 - o) B), one scalar s, fitted. Irradiance is exposed too, as
-  everywhere else, so that s means the same under a dim and a bright light; where no surfel is, both buffers
-  hold the environment, whose square would be a straw man.
+  everywhere else, so that s means the same under dim and bright lights; where no surfel is, both buffers
+  hold the environment, which must not be squared.
 - ``shadow_ratio``: D(B E / E0), the ratio being clamped (see :func:`shadow_ratio`).
 - ``shadowed``: kd E + split-sum specular, stored with the data.
 - ``affine``: w0 + w1 D(B) + w2 D(E), clipped to [0, 1]; weights of their own for each output channel.
@@ -22,18 +22,17 @@ over pi), e the clip's exposure, o the surfels' opacity and D = AgX(e ·) the di
 - ``lit_blended``: an affine blend of G(D(L)), G(D(B)), G(D(E)), G(S(A)) and S(A), weights and deviation by
   the mean PSNR of training frames (`PsnrAffineFit`).
 - ``lit_NAME``, such as ``lit_oidn``: D of L through each denoiser that is installed (:mod:`tron.denoising`).
-- ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: the blends of images so filtered.
+- ``affine_filtered``, ``affine_ratio_filtered``, ``affine_lit_filtered``: these blends of filtered images.
 - ``pixel_mlp``, ``pixel_mlp_lit``: 1x1 convolutions on D(B) and D(E), or on these and D(L).
 
-Baselines whose name says lit use bounced light, the others light that comes straight from the environment.
-``lit.supersampled`` and ``lit.reflections`` are ``lit`` at a higher price a frame: on 2 x 2 sub-pixels, and
-with rays to what surfaces mirror besides. Networks and blends are not given them, so they are no baselines;
-their rows say how far the picture without a network goes.
+Baselines with lit in their names use bounced light; the others use direct light from the environment.
+``lit.supersampled`` and ``lit.reflections`` are ``lit`` at a higher cost per frame: with 2 x 2 sub-pixels,
+and with reflection rays as well. Networks and blends do not see them, so they are no baselines; their rows
+show the best picture without a network.
 
-Blends and s are fitted on the foreground of training data (:mod:`eval.relighting.fits`). A blend of surfaces
-is wrong for the sky, which all buffers show as it is. On full frames blends and pixel networks are
-therefore laid over pbr, whose sky is the displayed environment: o x blend + (1 - o) D(B). The other methods
-show the environment by themselves.
+Blends and s are fitted on the foreground of training data (:mod:`eval.relighting.fits`). A blend fitted to
+surfaces is wrong for the sky. On full frames, blends and pixel networks are therefore composited over pbr,
+which shows the environment: o x blend + (1 - o) D(B). The other methods show the environment by themselves.
 
 A new baseline is one more entry of BASELINES: scores, tables and pictures iterate over it.
 """
@@ -74,7 +73,7 @@ SAMPLED_PIXELS = 512
 
 
 def shadow_ratio(buffers: Buffers) -> np.ndarray:
-    """pbr times the share of irradiance that arrives, per channel: (..., 3) float32, linear, in pbr's unit.
+    """Return pbr times the visible share of irradiance per channel: (..., 3) float32, linear, in pbr's unit.
 
     The share is irradiance / unshadowed clamped to [0, 1]: visibility only removes light, and what exceeds 1
     is Monte Carlo noise. Where ``exposure * unshadowed`` is under RATIO_FLOOR there is no light to lose and
@@ -87,32 +86,32 @@ def shadow_ratio(buffers: Buffers) -> np.ndarray:
 
 
 def show_pbr(buffers: Buffers) -> np.ndarray:
-    """D(B), (..., 3) in [0, 1]; so the next ones."""
+    """Return D(B), (..., 3) in [0, 1]."""
     return buffers.displayed("pbr")
 
 
 def show_irradiance(buffers: Buffers) -> np.ndarray:
-    """D(E)."""
+    """Return D(E), (..., 3) in [0, 1]."""
     return buffers.displayed("irradiance")
 
 
 def show_lit(buffers: Buffers) -> np.ndarray:
-    """D(L)."""
+    """Return D(L), (..., 3) in [0, 1]."""
     return buffers.displayed("lit")
 
 
 def show_albedo(buffers: Buffers) -> np.ndarray:
-    """Base color of the surfels by the sRGB curve."""
+    """Return the surfels' base color after the sRGB curve."""
     return buffers.displayed("albedo")
 
 
 def show_shadow_ratio(buffers: Buffers) -> np.ndarray:
-    """D(B E / E0)."""
+    """Return D(B E / E0), (..., 3) in [0, 1]."""
     return to_display(shadow_ratio(buffers), buffers.exposure)
 
 
 def show_denoised(buffers: Buffers, name: str) -> np.ndarray:
-    """Displayed ``lit`` of whole clips (K, H, W, 3), through a denoiser frame by frame."""
+    """Return displayed ``lit`` of whole clips (K, H, W, 3), denoised frame by frame."""
     guides = {each: buffers[each] for each in DENOISERS[name].wants}
     frames = [
         denoised(name, lit, {each: images[k] for each, images in guides.items()})
@@ -123,12 +122,12 @@ def show_denoised(buffers: Buffers, name: str) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Method:
-    """A way to make the picture from the guidance.
+    """A method that makes the picture from the guidance.
 
     Attributes:
-        name: in rows of results.json: ``NAME.psnr``.
-        title: in tables and under pictures.
-        what: what it does, in a few words.
+        name: name in rows of results.json: ``NAME.psnr``.
+        title: title in tables and under pictures.
+        what: short description.
     """
 
     name: str
@@ -142,15 +141,15 @@ SIMPLE, DIRECT, ON_LIT = "best_simple_baseline", "best_direct_baseline", "best_f
 
 @dataclass(frozen=True)
 class Baseline(Method):
-    """A method that the neural renderer is held against.
+    """A baseline of the neural renderer.
 
     Attributes:
-        show: the method; None where it is fitted, or a network whose weights are given.
+        show: the method; None if it is fitted, or is a network with given weights.
         fit: starts a fit of the method on training data.
-        surfaces: knows surfaces alone, and is laid over pbr on full frames.
-        groups: over the best of each of which gains are reported, beside the best of all baselines.
-        optional: the best of a group is known without it.
-        pictured: stands among the pictures of the report.
+        surfaces: whether it shows surfaces only; full frames composite it over pbr.
+        groups: groups of baselines; gains over the best of each group are reported.
+        optional: whether the best of a group is defined without it.
+        pictured: whether the report shows its pictures.
         needs: member of reference clips that it shows.
     """
 
@@ -344,11 +343,11 @@ METHODS: tuple[Method, ...] = (*NETWORKS, *BASELINES, *FINER)
 
 
 def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
-    """Baseline name -> the method as fitted on the foreground of training clips.
+    """Fit baselines on the foreground of training clips; return name -> method.
 
     Args:
         clips: the training split, read once, one clip in memory at a time.
-        seed: of the choice of pixels, where some are enough.
+        seed: seed of the choice of pixels for fits on a sample.
 
     Raises:
         TronError: there are no training clips, or they have no foreground.
@@ -376,16 +375,16 @@ def fit_baselines(clips: Iterable[Clip], seed: int) -> dict[str, Fitted]:
 def predictions(
     clip: Clip, methods: Mapping[str, Show], seconds: MutableMapping[str, list[float]] | None = None
 ) -> dict[Region, dict[str, np.ndarray]]:
-    """Pictures of a clip by every method that needs neither fit nor weights and by the ``methods`` given.
+    """Render a clip by the given ``methods`` and by every method without fit and weights.
 
     Args:
         clip: with the members MEMBERS.
         methods: name -> fitted baseline or network.
-        seconds: method name -> takes what a frame of this clip took, AgX of the buffers not counted.
+        seconds: method name -> list that receives the seconds per frame, without AgX of the buffers.
 
     Returns:
         Region -> method name -> (K, H, W, 3) display float32 in [0, 1]. The regions differ only for baselines
-        of ``surfaces``, which full frames show over the environment.
+        with ``surfaces``, which are composited over the environment in full frames.
     """
     buffers = Buffers.of(clip)
     plain = {

@@ -34,25 +34,27 @@ Weights = Path | Annotated[tuple[Path, ...], Field(min_length=1)]
 
 
 class Relighting(Benchmark):
-    """Settings: the data set, the weights, and how much of them is shown."""
+    """Settings: the data set, the weights, and the number of clips on the page."""
 
     name: ClassVar[str] = "relighting"
 
-    dataset: DatasetPlace | None = Field(description="folder that tron-datagen wrote, or its URL")
+    dataset: DatasetPlace | None = Field(description="folder written by tron-datagen, or its URL")
     renderer: Weights | None = Field(
         default=None,
         description="weights of the neural renderer, .safetensors, or the name of a shipped checkpoint "
         f"({', '.join(SHIPPED)}); of two, [a,b], one sees lit, one does not",
     )
-    pixel_mlp: Weights | None = Field(default=None, description="weights of the pixel MLP baseline, likewise")
+    pixel_mlp: Weights | None = Field(
+        default=None, description="weights of the pixel MLP baseline; [a,b] as for renderer"
+    )
     ood: DatasetPlace | None = Field(
         default=None,
         description="data set of another kind (tron-datagen experiment=models): its test split gives rows "
         "that end in .ood, by the same weights and fits",
     )
-    vae: Path | None = Field(default=None, description="the WAN 2.1 VAE, where the renderer's codec needs it")
+    vae: Path | None = Field(default=None, description="file of the WAN 2.1 VAE, if the codec needs it")
     train_splits: list[str] = Field(
-        default=["train"], description="splits that the fitted baselines see", min_length=1
+        default=["train"], description="splits for fitting baselines", min_length=1
     )
     fitted_on: DatasetPlace | None = Field(
         default=None,
@@ -60,7 +62,7 @@ class Relighting(Benchmark):
         "benchmark such as TRON-Synth",
     )
     test_split: str = "test"
-    pictures: NonNegativeInt = Field(default=6, description="held-out clips shown side by side")
+    pictures: NonNegativeInt = Field(default=6, description="number of held-out clips on the page")
     threads: PositiveInt = 1
     seed: int = 0
 
@@ -85,7 +87,7 @@ class Relighting(Benchmark):
             raise TronError("weights not found", self.vae, "give the WAN 2.1 VAE's file")
 
     def run(self, output_dir: Path) -> Outcome:
-        """Fit on the training splits, score the test split, choose and make the pictures."""
+        """Fit on the training splits, score the test split, and make pictures of chosen clips."""
         self.check()
         dataset = self._dataset()
         set_torch_threads(self.threads)
@@ -139,14 +141,14 @@ class Relighting(Benchmark):
             yield from read_clips(self._fitted_on(), split, MEMBERS)
 
     def _weights(self) -> dict[str, list[Path]]:
-        """Kind of network -> files or names of all weights that were given."""
+        """Return kind of network -> files or names of all given weights."""
         given = {"neural": self.renderer, "pixel_mlp": self.pixel_mlp}
         return {
             kind: [paths] if isinstance(paths, Path) else [*(paths or ())] for kind, paths in given.items()
         }
 
     def _networks(self) -> dict[str, Network]:
-        """Method -> the network; TronError where two are the same method."""
+        """Return method -> network; TronError if two networks are the same method."""
         return {
             name: network
             for kind, paths in self._weights().items()
@@ -155,7 +157,7 @@ class Relighting(Benchmark):
 
 
 def _show(outcome: Outcome, examples: list[Example]) -> None:
-    """The middle example for the first screen, then all, and the guidance of one a family of lights."""
+    """Show the middle example on the first screen, then all, and the guidance of one per light family."""
     if examples:
         outcome.show("opening", "opening", opening(examples[len(examples) // 2]))
     for each in examples:
@@ -166,7 +168,7 @@ def _show(outcome: Outcome, examples: list[Example]) -> None:
 
 
 def stand_ins(dataset: Place) -> str:
-    """Sentence of the data set's sources.json on named assets that something else stands in for."""
+    """Return a sentence on the assets that the data set replaced by others, from its sources.json."""
     folder, name = DatasetFolder(dataset), "sources.json"
     try:
         found = json.loads(folder.read(name))["stand_ins"] if folder.size(name) is not None else None

@@ -1,7 +1,7 @@
-"""A cross-bilateral filter of ``lit``, led by base color, by the surface and by ``lit`` itself, filtered.
+"""A cross-bilateral filter of ``lit``, guided by base color, by the surface and by filtered ``lit``.
 
-What a denoiser without a network does with the buffers that it is given (Eisemann and Durand 2004; Petschnigg
-et al. 2004): neighbours count by their distance and by how alike their guides are,
+It is a denoiser without a network (Eisemann and Durand 2004; Petschnigg et al. 2004): neighbours are weighted
+by distance and by similarity of their guides,
 
     w = exp(-d² / 2 s²) exp(-(|A - A'|² / a² + |S - S'|² / b² + |G - G'|² / c²) / 2 k²)
 
@@ -33,11 +33,11 @@ REACH = 3
 
 
 def bilateral(buffers: Buffers, settings: np.ndarray) -> np.ndarray:
-    """Displayed lit of whole clips, filtered in several ways.
+    """Filter displayed lit of whole clips with several settings.
 
     Args:
-        buffers: of images (K, H, W, C).
-        settings: (n, 2) s and k of each way.
+        buffers: buffers of images (K, H, W, C).
+        settings: (n, 2), pairs of s and k.
 
     Returns:
         (n, K, H, W, 3) float32 display values.
@@ -79,7 +79,7 @@ class BilateralFit:
         self._psnr: list[np.ndarray] = []
 
     def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
-        """As Fit.add, of the clip's middle frame; one without foreground says nothing."""
+        """As Fit.add, for the clip's middle frame; a frame without foreground is ignored."""
         middle = len(truth) // 2
         mask = np.zeros(truth.shape[:3], bool)
         mask[inside] = True
@@ -89,7 +89,7 @@ class BilateralFit:
         self._psnr.append(np.array([capped_psnr(image, truth[middle], mask[middle]) for image in shown]))
 
     def solve(self) -> Fitted:
-        """s and k, (2,)."""
+        """Return s and k, (2,)."""
         mean = np.mean(self._psnr, axis=0) if self._psnr else np.zeros(len(self.SETTINGS))
         chosen = self.SETTINGS[int(np.argmax(mean))]
         return Fitted(lambda buffers: bilateral(buffers, chosen[None])[0], chosen)

@@ -1,4 +1,4 @@
-"""Guidance of a clip as methods see it, and the pixels on which they are judged."""
+"""Guidance of a clip for methods, and the pixels to judge."""
 
 from __future__ import annotations
 
@@ -29,11 +29,11 @@ PAIRS = 64
 
 @dataclass(frozen=True)
 class Buffers:
-    """Members of any pixels of a clip, by name.
+    """Members of a clip at some pixels, by name.
 
     Attributes:
         images: (..., C) float32 each, linear, as stored.
-        exposure: the clip's factor before the tone curve.
+        exposure: factor before the tone curve.
         motion: of the surfaces of a whole clip, from cameras and the depth of the surfels, which whoever
             renders it has, and of the object that moves; None where that depth was not read.
     """
@@ -54,18 +54,18 @@ class Buffers:
         return Buffers({name: image[pixels] for name, image in self.images.items()}, self.exposure)
 
     def __getitem__(self, name: str) -> np.ndarray:
-        """One of the members, linear."""
+        """Return a member, linear."""
         return self.images[name]
 
     def displayed(self, name: str) -> np.ndarray:
-        """One of the members as displayed: (..., 3) in [0, 1], computed once."""
+        """Return a member in display values: (..., 3) in [0, 1], computed once."""
         if name not in self._displayed:
             self._displayed[name] = displayed(name, self[name], self.exposure)
         return self._displayed[name]
 
 
 def _motion(clip: Clip) -> Motion:
-    """Motion of a clip's surfaces; what its metadata say of it is read when a match is asked for."""
+    """Return the motion of a clip's surfaces; its metadata are read at the first match."""
 
     @cache
     def known() -> Motion:
@@ -83,7 +83,7 @@ def _motion(clip: Clip) -> Motion:
 
 
 def region_mask(clip: Clip, region: Region) -> np.ndarray:
-    """Pixels of a region, (K, H, W) bool: the ground-truth foreground, its metals, its rest, or all."""
+    """Return pixels of a region, (K, H, W) bool: true foreground, its metals, its other materials, or all."""
     foreground = clip.frames["foreground"][..., 0] > 0.5
     if region == "frame":
         return np.ones_like(foreground)

@@ -1,7 +1,6 @@
 """Least-squares fits of the baselines, streamed over the training data in float64.
 
-The error is that of displayed values, which PSNR measures. Float32 sums over millions of pixels were several
-dB off.
+The error is in display values, as for PSNR. Float32 sums over millions of pixels were several dB off.
 """
 
 from __future__ import annotations
@@ -25,7 +24,7 @@ FAINTEST = 0.02
 
 
 class Fitted(NamedTuple):
-    """A method, and the numbers that were found for it.
+    """A method, and its fitted weights.
 
     Attributes:
         show: the method.
@@ -37,28 +36,28 @@ class Fitted(NamedTuple):
 
 
 class Fit(Protocol):
-    """Collects training pixels, one clip after another, and finds a method's weights."""
+    """Fit of a method's weights to training pixels, which are added clip by clip."""
 
     sampled: ClassVar[bool]
     """Whether some of the foreground's pixels are enough, chosen at random; otherwise it is given all."""
 
     def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
-        """Take pixels of a clip: buffers and displayed truth, (..., 3), of which ``inside`` indexes n."""
+        """Add the pixels ``inside`` of a clip: buffers and displayed truth, (..., 3)."""
 
     def solve(self) -> Fitted:
-        """The method with the least squared error on the pixels that were added."""
+        """Return the method with the least squared error on the added pixels."""
         ...
 
 
 def product_terms(buffers: Buffers) -> tuple[np.ndarray, np.ndarray]:
-    """Split e (o s B e E + (1 - o) B) into what s multiplies and the rest, (..., 3) exposed linear each."""
+    """Split e (o s B e E + (1 - o) B) into the factor of s and the rest, (..., 3) exposed linear each."""
     exposed = buffers["pbr"] * buffers.exposure
     lit = buffers["mask"] * exposed * (buffers["irradiance"] * buffers.exposure)
     return lit, (1 - buffers["mask"]) * exposed
 
 
 def show_product(buffers: Buffers, scale: float) -> np.ndarray:
-    """AgX of ``scale * product + rest``: (..., 3) in [0, 1]."""
+    """Return AgX of ``scale * product + rest``: (..., 3) in [0, 1]."""
     product, rest = product_terms(buffers)
     return agx(scale * product + rest)
 
@@ -76,7 +75,7 @@ class ProductFit:
         self._pixels.append(np.stack([*product_terms(buffers.at(inside)), truth[inside]]).astype(np.float64))
 
     def solve(self) -> Fitted:
-        """The scale, (1,), with the least displayed squared error."""
+        """Return the scale, (1,), with the least squared error in display values."""
         product, rest, truth = np.concatenate(self._pixels, axis=1)
 
         def error(log_scale: float) -> float:
@@ -93,7 +92,7 @@ class ProductFit:
 
 
 class AffineFit:
-    """A blend of displayed ``inputs`` and a constant, of its own for each output channel, clipped to [0, 1].
+    """An affine blend of displayed ``inputs`` with weights per output channel, clipped to [0, 1].
 
     Its normal equations are summed over any number of pixels.
     """
@@ -120,12 +119,12 @@ class AffineFit:
         self._square += (target**2).sum(0)
 
     def solve(self) -> Fitted:
-        """The least-squares weights, (3 output channels, inputs + 1); the last column is the constant."""
+        """Return the least-squares weights, (3 output channels, inputs + 1); the constant is last."""
         weights = self.weights()
         return Fitted(self.shown_by(weights), weights)
 
     def shown_by(self, weights: np.ndarray) -> Show:
-        """The blend of the inputs by weights (3, inputs + 1)."""
+        """Return the method that blends the inputs by weights (3, inputs + 1)."""
 
         def show(buffers: Buffers) -> np.ndarray:
             blend = weights[:, -1] + sum(w * image for w, image in zip(weights.T, self._images(buffers)))
@@ -140,18 +139,18 @@ class AffineFit:
         self._square += share * other._square
 
     def error(self) -> float:
-        """Sum of the squared errors of the solution, before it is clipped."""
+        """Return the sum of squared errors of the solution, before clipping."""
         return self.error_of(self.weights())
 
     def error_of(self, weights: np.ndarray) -> float:
-        """The same of any weights (3, inputs + 1)."""
+        """Return the sum of squared errors of any weights (3, inputs + 1), before clipping."""
         explained = 2 * (weights * self._moment).sum(1) - np.einsum(
             "ci,cij,cj->c", weights, self._gram, weights
         )
         return float((self._square - explained).sum())
 
     def weights(self) -> np.ndarray:
-        """The least-squares weights."""
+        """Return the least-squares weights."""
         diagonal = np.einsum("cii->ci", self._gram)
         ridge = np.eye(self._gram.shape[-1]) * (self.RIDGE * diagonal)[:, None, :]
         return np.linalg.solve(self._gram + ridge, self._moment[..., None])[..., 0]
@@ -161,7 +160,7 @@ class AffineFit:
 
 
 def filtered(show: Show, deviation: float) -> Show:
-    """A method whose pictures (K, H, W, 3) a Gaussian filters, frame by frame; the edge goes on beyond."""
+    """Return a method with its pictures (K, H, W, 3) filtered by a Gaussian; the border is replicated."""
 
     def shown(buffers: Buffers) -> np.ndarray:
         return scipy.ndimage.gaussian_filter(
@@ -172,10 +171,9 @@ def filtered(show: Show, deviation: float) -> Show:
 
 
 def remodulated(deviation: float) -> Show:
-    """Lit without its base color, filtered by a Gaussian in linear light, and with base color again.
+    """Divide lit by base color, filter by a Gaussian in linear light, and multiply by base color again.
 
-    What a denoiser does with the buffers that it is given: the texture of ``albedo`` stays sharp. Base colors
-    below FAINTEST count as that.
+    The texture of ``albedo`` stays sharp, as in a denoiser. Base colors are at least FAINTEST.
     """
 
     def shown(buffers: Buffers) -> np.ndarray:
@@ -206,15 +204,15 @@ class GaussianFit:
             )
 
     def solve(self) -> Fitted:
-        """The deviation in pixels, (1,)."""
+        """Return the deviation in pixels, (1,)."""
         best = min(DEVIATIONS, key=self._errors.__getitem__)
         return Fitted(self._shown[best], np.array([best]))
 
 
 class FilteredAffineFit:
-    """An AffineFit of inputs that the best Gaussian of DEVIATIONS filtered first; needs whole clips.
+    """An AffineFit of inputs filtered by the best Gaussian of DEVIATIONS; needs whole clips.
 
-    ``sharp`` inputs are taken as they are besides: less what the Gaussian leaves of them they are detail.
+    ``sharp`` inputs are used unfiltered too: minus their filtered copies they are detail.
     """
 
     sampled: ClassVar[bool] = True
@@ -226,12 +224,12 @@ class FilteredAffineFit:
         }
 
     def add(self, buffers: Buffers, truth: np.ndarray, inside: Any = ...) -> None:
-        """As Fit.add, by each of the fits."""
+        """As Fit.add, for each deviation."""
         for fit in self._fits.values():
             fit.add(buffers, truth, inside)
 
     def solve(self) -> Fitted:
-        """The weights of AffineFit for the Gaussian with which its error is least."""
+        """Return AffineFit's weights for the Gaussian with the least error."""
         return min(self._fits.values(), key=AffineFit.error).solve()
 
 
@@ -241,13 +239,13 @@ LEAST_ERROR = 1e-6
 
 
 class PsnrAffineFit:
-    """FilteredAffineFit by mean PSNR: weights and Gaussian with the highest mean over training frames.
+    """A FilteredAffineFit that maximises mean PSNR over training frames.
 
-    Squared errors of all pixels together are mostly those of the worst frames; the mean of their logarithms
-    counts a factor of an error alike in each. It is minimised by least squares that are weighted anew (Lange
+    The worst frames dominate the sum of all squared errors; in the mean of logarithms, a factor on the error
+    counts the same in each frame. It is minimised by iteratively reweighted least squares (Lange
     2016, *MM Optimization Algorithms*, majorising the concave logarithm by its tangent): a frame has the
-    weight of one over its squared error by the last solution. ``sharp`` inputs are taken as they are
-    besides. Needs whole clips.
+    weight of one over its squared error by the last solution. ``sharp`` inputs are used unfiltered
+    too. Needs whole clips.
     """
 
     sampled: ClassVar[bool] = True
@@ -274,7 +272,7 @@ class PsnrAffineFit:
                 self._frames[deviation].append(fit)
 
     def solve(self) -> Fitted:
-        """The weights, (3 output channels, inputs + 1)."""
+        """Return the weights, (3 output channels, inputs + 1)."""
         counts = np.array(self._pixels, float)
         found = {each: fitted_by_psnr(frames, counts) for each, frames in self._frames.items()}
         best = max(found, key=lambda deviation: found[deviation][1])
@@ -283,7 +281,7 @@ class PsnrAffineFit:
 
 
 def fitted_by_psnr(frames: Sequence[AffineFit], counts: np.ndarray) -> tuple[np.ndarray, float]:
-    """Weights of highest mean PSNR of frames, and that mean, dB."""
+    """Return the weights with the highest mean PSNR over frames, and this mean in dB."""
     share = np.ones(len(frames))
     weights = np.zeros(0)
     errors = np.ones(len(frames))

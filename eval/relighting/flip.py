@@ -1,4 +1,4 @@
-"""NVIDIA's FLIP: the difference that one sees between two pictures shown in turn, where flip-evaluator is."""
+"""NVIDIA's FLIP: visible difference of two pictures shown in turn; needs flip-evaluator."""
 
 from __future__ import annotations
 
@@ -14,10 +14,10 @@ INSTALLED = importlib.util.find_spec("flip_evaluator") is not None
 def flip(
     image: np.ndarray, truth: np.ndarray, mask: np.ndarray | None, kind: Literal["LDR", "HDR"] = "LDR"
 ) -> float:
-    """Mean over the mask of FLIP, 67 pixels a degree, tone mapper ACES where HDR; 0 is identical.
+    """Return the mean FLIP over the mask at 67 pixels per degree; HDR uses tone mapper ACES; 0 is identical.
 
     Args:
-        image, truth: (H, W, 3), display values in [0, 1], or exposed radiance where HDR.
+        image, truth: (H, W, 3), display values in [0, 1], or exposed radiance for HDR.
         mask: (H, W) bool; None: all pixels.
     """
     import flip_evaluator

@@ -1,4 +1,4 @@
-"""Side-by-side pictures of held-out frames: methods against the truth, the guidance against its own."""
+"""Side-by-side pictures of held-out frames: methods and the truth, guidance and true guidance."""
 
 from __future__ import annotations
 
@@ -41,12 +41,12 @@ class Example:
     """The middle frame of a clip, display values (H, W, 3).
 
     Attributes:
-        meta: of the clip.
-        frame: its number.
+        meta: metadata of the clip.
+        frame: number of the frame.
         methods: method name -> its picture.
-        irradiance: as displayed.
+        irradiance: irradiance in display values.
         truth: the path-traced picture.
-        psnr: method name -> dB on the foreground of this very picture.
+        psnr: method name -> dB on the foreground of this picture.
         guidance: title -> picture of the guidance or its error; empty without references.
     """
 
@@ -67,7 +67,7 @@ class Example:
 
 
 def middle_frame(clip: Clip, shown: dict[str, np.ndarray], truth: np.ndarray) -> Example:
-    """Take the middle frame of a clip's predictions (method -> (K, H, W, 3)) and of its truth."""
+    """Return the middle frame of a clip's predictions (method -> (K, H, W, 3)) and of its truth."""
     k = clip.meta.frames // 2
     methods = {name: images[k] for name, images in shown.items()}
     foreground = clip.frames["foreground"][k, ..., 0] > 0.5
@@ -102,7 +102,7 @@ def _guidance_pictures(clip: Clip, k: int) -> dict[str, np.ndarray]:
 
 
 def _shadow_errors(frame: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarray:
-    """The true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
+    """Draw the true irradiance in faint grey, leaking pixels orange, darkened pixels blue."""
     found = frame_shadow_pixels(frame, same_depth(frame))
     picture = np.repeat(luminance(truth)[..., None] * 0.6, 3, axis=-1)
     picture[found.leaking] = (1.0, 0.5, 0.05)
@@ -111,7 +111,7 @@ def _shadow_errors(frame: dict[str, np.ndarray], truth: np.ndarray) -> np.ndarra
 
 
 def comparison(example: Example) -> Pictures:
-    """The guidance and the methods beside the truth, and the errors of lit and of the network."""
+    """Show guidance and methods beside the truth, and errors of lit and of the network."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"
     shown = [method for method in PICTURED if method.name in example.methods]
     network = next((method for method in NETWORKS if method in shown), None)
@@ -136,7 +136,7 @@ def comparison(example: Example) -> Pictures:
 
 
 def opening(example: Example) -> Pictures:
-    """Beginning of a page: lit, the network and the truth of one frame; pbr where there is no network."""
+    """Show lit, the network and the truth of one frame on the first screen; pbr if there is no network."""
     whole = comparison(example).pictures
     network = next((method for method in NETWORKS if method.name in example.methods), None)
     titles = [LIT.title if network else "pbr", network.title if network else LIT.title, "path-traced truth"]
@@ -145,7 +145,7 @@ def opening(example: Example) -> Pictures:
 
 
 def guidance(example: Example) -> Pictures:
-    """Irradiance, its reference and errors; base color and normals of the surfels beside the true ones."""
+    """Show irradiance, its reference and errors; base color and normals beside the true ones."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"
     pictures = [Picture(image, name, f"{name}, {where}") for name, image in example.guidance.items()]
     return Pictures(example.title, pictures)

@@ -1,8 +1,8 @@
-"""Quality of the surfels and their irradiance, before any network: measured against the path tracer.
+"""Errors of the surfels and their irradiance against the path tracer, before any network.
 
-A tracer that leaks would make a network look good, so its errors are quoted beside the network's gain.
-Irradiance is judged against Mitsuba's direct irradiance, never through the final image: leaks fake bounce
-light.
+A leaking tracer would make a network look good, so its errors are reported beside the network's gain.
+Irradiance is compared with Mitsuba's direct irradiance, never through the final image: leaks look like
+bounced light.
 """
 
 from __future__ import annotations
@@ -28,11 +28,11 @@ FRACTIONS = {"guidance.shadow_leak": (1, 0), "guidance.lit_darkened": (3, 2)}
 
 @dataclass
 class GuidanceScores:
-    """Measurements of test clips; a clip without the reference members adds nothing.
+    """Errors in test clips; clips without reference members are ignored.
 
     Attributes:
         irradiance_psnr: family of lights -> (scene, dB) of each frame.
-        shadows: (key of JUDGED, family of lights) -> (scene, counts of ShadowPixels) of each frame.
+        shadows: (key of JUDGED, family of lights) -> (scene, counts of ShadowPixels) per frame.
         base_color_psnr: (scene, dB) of each view.
         normal_error: (scene, degrees) of each view.
     """
@@ -78,13 +78,13 @@ class GuidanceScores:
                 self.normal_error.append((meta.scene, metrics.angular_error_deg(ours, truth, both)))
 
     def rows(self, seed: int = 0) -> list[Row]:
-        """``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*``; what was not measured has no row.
+        """Return rows ``guidance.*`` (all lights, and ``.FAMILY``) and ``surfels.*`` of what was measured.
 
-        ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames; the two
-        fractions are taken over the pixels of all frames together, for a frame may hold hardly any shadow.
-        They are judged where surfels and truth show the same surface by its distance; ``_same_normal`` goes
-        by its normal, and ``_with_silhouettes`` also judges pixels where they show different surfaces.
-        ``seed`` draws the scenes of the intervals.
+        ``guidance.irradiance_psnr`` is the lowest of the light families' means over frames. The two fractions
+        are over the pixels of all frames together, because a frame may have hardly any shadow. Pixels are
+        judged where surfels and truth show the same surface by distance; ``_same_normal`` decides by normals,
+        and ``_with_silhouettes`` also judges pixels with different surfaces. ``seed`` draws the scenes of the
+        intervals.
         """
         irradiance = [
             mean_row(f"guidance.irradiance_psnr.{family}", "dB", values, seed)
@@ -107,7 +107,7 @@ class GuidanceScores:
 
 
 def shadow_rows(tail: str, counted: Sequence[tuple[str, np.ndarray]], seed: int) -> Iterator[Row]:
-    """The FRACTIONS of frames' pixels; ``counted`` are (scene, counts of ShadowPixels)."""
+    """Yield rows of the FRACTIONS of pixels; ``counted`` are (scene, counts of ShadowPixels) per frame."""
     counts = np.array([pixels for _, pixels in counted], float).reshape(len(counted), 4)
     of_scenes = scene_sums([scene for scene, _ in counted], counts)
     for metric, (bad, of) in FRACTIONS.items():

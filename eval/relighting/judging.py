@@ -1,4 +1,4 @@
-"""Every method on the test split of a data set: its scores, and pictures of some clips."""
+"""Score every method on the test split of a data set, and make pictures of some clips."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ log = logging.getLogger("tron.eval")
 
 
 class Judged(NamedTuple):
-    """Scores of every method, and examples from the one with the least gain to the one with the most."""
+    """Scores of every method, and examples from the least gain to the greatest."""
 
     scores: Scores
     examples: list[Example]
@@ -42,11 +42,11 @@ def judge(
 
     Args:
         methods: scene -> fitted baselines and networks by their names.
-        pictures: clips that are shown.
-        scores: that the clips join.
-        members: of the clips, all by default.
-        look: called with every clip besides.
-        truth: of a clip, (K, H, W, 3) display values.
+        pictures: number of clips to show.
+        scores: scores to extend.
+        members: members of the clips to read, all by default.
+        look: callback for every clip.
+        truth: function of a clip that returns its truth, (K, H, W, 3) display values.
     """
     seconds: dict[str, list[float]] = {}
     for clip in read_clips(dataset, split, members):
@@ -62,10 +62,10 @@ def judge(
 
 
 def choose_clips(scores: Scores, count: int) -> list[str]:
-    """Clips to show: evenly spaced in the ranking by gain, so that the worst and the best are among them.
+    """Choose clips evenly spaced in the ranking by gain, including the worst and the best.
 
-    The gain is the network's PSNR minus that of the best of the baselines that were scored, foreground;
-    without a network the clips are ranked by the PSNR of lit.
+    The gain is the network's foreground PSNR minus the PSNR of the best scored baseline; without a network,
+    clips are ranked by the PSNR of lit.
     """
     baselines = [method.name for method in scores.methods if method in BASELINES]
 

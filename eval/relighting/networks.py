@@ -1,4 +1,4 @@
-"""Networks that are judged, and how they show a clip."""
+"""Networks to judge, and their rendering of a clip."""
 
 from __future__ import annotations
 
@@ -25,7 +25,7 @@ if TYPE_CHECKING:
 
 @dataclass(frozen=True)
 class Network:
-    """A network that was read from a file."""
+    """A network read from a file."""
 
     path: Path
     renderer: Renderer
@@ -36,7 +36,7 @@ class Network:
         return "lit" in self.renderer.config.guidance
 
     def show(self, buffers: Buffers, window: int = 1, overlap: Overlap = "anchor") -> np.ndarray:
-        """Its pictures of a clip, (K, H, W, 3) display float32 in [0, 1], as `render_clip` gives them."""
+        """Render a clip, (K, H, W, 3) display float32 in [0, 1], by `render_clip`."""
         from tron.neural.renderer import render_clip
 
         displayed = {name: buffers.displayed(name) for name in self.renderer.config.guidance}
@@ -44,10 +44,10 @@ class Network:
 
 
 def find_weights(given: str | Path) -> Path:
-    """The file that a path or a shipped name stands for.
+    """Return the file of a path or a shipped name.
 
     Raises:
-        TronError: there is no such file, and nothing of that name is shipped.
+        TronError: there is no such file, and no shipped checkpoint of that name.
     """
     path = checkpoint_file(given)
     if not path.is_file():
@@ -57,12 +57,12 @@ def find_weights(given: str | Path) -> Path:
 
 
 def load_networks(kind: str, given: Iterable[str | Path], vae: Path | None = None) -> dict[str, Network]:
-    """Read weights, onto the device of the active Mitsuba variant; torch is imported here and not before.
+    """Read weights onto the device of the active Mitsuba variant; torch is imported here and not before.
 
     Args:
-        kind: such as neural; its network that sees lit is called neural_lit.
-        given: at most one of each.
-        vae: the WAN 2.1 VAE, where a codec needs it.
+        kind: such as neural; its network with lit as guidance is called neural_lit.
+        given: files or names, at most one with lit and one without.
+        vae: file of the WAN 2.1 VAE, if a codec needs it.
 
     Raises:
         TronError: a file is missing or holds no renderer, or two are of one kind.
@@ -83,7 +83,7 @@ def load_networks(kind: str, given: Iterable[str | Path], vae: Path | None = Non
 
 @dataclass(frozen=True)
 class Guided:
-    """What a network is given of a lit scene: (K, H, W, 3) display values by name, and distances (H, W)."""
+    """Inputs of a network from a lit scene: (K, H, W, 3) display values by name, and distances (H, W)."""
 
     displayed: dict[str, np.ndarray]
     depths: list[np.ndarray]
@@ -92,7 +92,7 @@ class Guided:
 def guided(
     network: Network, light: Illumination, cameras: Sequence[Camera], exposure: float, seed: int
 ) -> Guided:
-    """Trace what a network is given of some frames."""
+    """Trace the inputs of a network for some frames."""
     names, depths, frames = network.renderer.config.guidance, [], []
     for camera in cameras:
         guidance = light.render(camera, seed)
@@ -107,7 +107,7 @@ def guided(
 def drawn(
     network: Network, light: Illumination, cameras: Sequence[Camera], exposure: float, seed: int
 ) -> np.ndarray:
-    """Pictures (K, H, W, 3), display values, of a lit scene; of several all are averaged along the motion."""
+    """Render a lit scene by a network, (K, H, W, 3) display values; several are averaged along motion."""
     from tron.neural.renderer import render_clip
 
     given = guided(network, light, cameras, exposure, seed)

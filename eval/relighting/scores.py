@@ -1,9 +1,10 @@
-"""Metrics of every method on every held-out frame, and the rows made of them.
+"""Metrics of every method on every held-out frame, and their rows.
 
-A metric is computed on each displayed frame and then averaged over frames, PSNR too, not of an average
-error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has no finite
-PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes (:mod:`eval.confidence`), whose
-frames and lights are no independent observations; a gain's is of the differences on the same frames.
+A metric is computed on each displayed frame and then averaged over frames. PSNR is averaged too, not computed
+from a mean error: a dark, easy frame counts as much as a bright, hard one. A frame that equals the truth has
+no finite PSNR and counts as PSNR_CAP of :mod:`tron.metrics`. Intervals are over scenes
+(:mod:`eval.confidence`), whose frames and lights are no independent observations; a gain's is of the
+differences on the same frames.
 
 A new metric is one more entry of METRICS: rows and tables iterate over it.
 """
@@ -41,13 +42,13 @@ class Metric(NamedTuple):
     """A figure of one displayed frame against the truth.
 
     Attributes:
-        name: in rows: ``METHOD.NAME``.
-        title: in tables, with an arrow to its better side.
-        unit: of its rows.
+        name: name in rows: ``METHOD.NAME``.
+        title: title in tables, with an arrow for the better side.
+        unit: unit of the rows.
         measure: (image, truth, mask or None) -> the figure; images (H, W, 3) in [0, 1], mask (H, W) bool.
         what: how to read it, a sentence or two.
         better: the good side; gains are towards it.
-        regions: where it is measured.
+        regions: regions of the measurement.
     """
 
     name: str
@@ -112,7 +113,7 @@ GAINS: dict[str, dict[str, list[str]]] = {
 
 
 class Where(NamedTuple):
-    """Part of the scores: a region, of all clips, or of one family of lights, style of scene, or clip."""
+    """Selection of scores: a region in all clips, or in one light family, one style of scene, or one clip."""
 
     region: Region = "foreground"
     family: str | None = None
@@ -121,11 +122,11 @@ class Where(NamedTuple):
 
     @property
     def tail(self) -> str:
-        """End of the rows' names: ``_full`` of frames, ``_metal``, ``_rest``; ``.FAMILY`` or ``.STYLE``."""
+        """End of rows' names: ``_full`` (full frames), ``_metal``, ``_rest``; ``.FAMILY`` or ``.STYLE``."""
         return self.tail_after("")
 
     def tail_after(self, size: str) -> str:
-        """The same with something between the region and the kind."""
+        """End of the rows' names with something between the region and the kind."""
         kind = self.family or self.style
         region = {"foreground": "", "frame": "_full"}.get(self.region, f"_{self.region}")
         return region + size + (f".{kind}" if kind else "")
@@ -136,7 +137,7 @@ ALL = Where()
 
 @dataclass(frozen=True)
 class Score:
-    """Metric name -> figure of one method on one frame of a clip."""
+    """Figures of one method on one frame of a clip, by metric."""
 
     family: str
     scene: str
@@ -150,10 +151,10 @@ class Scores:
     """All scores of an evaluation.
 
     Attributes:
-        kept: (method, region) -> one for each frame.
-        tail: end of the rows' names, after those of :class:`Where`.
-        materials: whether PSNRs of MATERIALS are taken besides.
-        more: figures besides of a frame's foreground: of (clip, number of the frame, picture, pixels).
+        kept: (method, region) -> a score for each frame.
+        tail: end of the rows' names, after the tail of :class:`Where`.
+        materials: whether PSNRs of MATERIALS are computed too.
+        more: function for further foreground figures, of (clip, number of the frame, picture, pixels).
     """
 
     tail: str = ""
@@ -201,28 +202,28 @@ class Scores:
 
     @property
     def clips(self) -> list[str]:
-        """Keys of the clips that were scored, in order."""
+        """Keys of the scored clips, in order."""
         return list(dict.fromkeys(score.clip for scores in self.kept.values() for score in scores))
 
     @property
     def families(self) -> list[str]:
-        """Light families that were scored, sorted."""
+        """Light families of the scored clips, sorted."""
         return sorted({score.family for scores in self.kept.values() for score in scores})
 
     @property
     def styles(self) -> list[str]:
-        """Styles of the scenes that were scored, sorted; none where all are of one."""
+        """Styles of the scored scenes, sorted; none if all have the same style."""
         found = sorted({score.style for scores in self.kept.values() for score in scores})
         return found if len(found) > 1 else []
 
     @property
     def methods(self) -> list[Method]:
-        """Methods that were scored, in the order of METHODS."""
+        """Scored methods, in the order of METHODS."""
         scored = {method for method, _ in self.kept}
         return [method for method in METHODS if method.name in scored]
 
     def of(self, method: str, where: Where) -> list[Score]:
-        """A method's scores, in the order of the frames."""
+        """Return a method's scores, in the order of the frames."""
         kept = self.kept.get((method, where.region), ())
         return [
             s
@@ -233,23 +234,23 @@ class Scores:
         ]
 
     def psnr(self, method: str, where: Where = ALL) -> float | None:
-        """Mean PSNR over frames in dB; None where nothing was scored."""
+        """Return the mean PSNR over frames in dB; None if nothing was scored."""
         return self.mean(method, where)
 
     def mean(self, method: str, where: Where = ALL, figure: str = "psnr") -> float | None:
-        """Mean of a metric over frames, in its unit; None where nothing was scored."""
+        """Return the mean of a metric over frames, in its unit; None if nothing was scored."""
         scores = self.of(method, where)
         return float(np.mean([score.figures[figure] for score in scores])) if scores else None
 
     @property
     def network(self) -> Method | None:
-        """The network that the report is about: that which sees lit, if it was scored."""
+        """The main network of the report: the network with lit as guidance, if it was scored."""
         return next((method for method in self.methods if method in NETWORKS), None)
 
     def best(self, methods: Sequence[str], where: Where = ALL, figure: str = "psnr") -> str | None:
-        """The method with the best mean of a metric; None unless all were scored that are not OPTIONAL.
+        """Return the method with the best mean of a metric; None unless all but OPTIONAL ones were scored.
 
-        Of all methods (BEST_OF_ALL) it is the best of those that were scored.
+        For BEST_OF_ALL it is the best of the scored methods.
         """
         means = {method: self.mean(method, where, figure) for method in methods}
         known = {method: mean for method, mean in means.items() if mean is not None}
@@ -260,16 +261,16 @@ class Scores:
     def gain(
         self, method: str, over: Sequence[str], where: Where = ALL, figure: str = "psnr"
     ) -> float | None:
-        """How much better the mean of a metric of a method is than that of the best of others.
+        """Return the gain of a method in the mean of a metric over the best of others.
 
-        None where one is not known.
+        None if either mean is unknown.
         """
         ours, best = self.mean(method, where, figure), self.best(over, where, figure)
         reached = None if best is None else self.mean(best, where, figure)
         return None if ours is None or reached is None else SIGNS[figure] * (ours - reached)
 
     def rows(self, seed: int = 0) -> Iterator[Row]:
-        """``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, each with the tail of :class:`Where`.
+        """Yield rows ``METHOD.METRIC`` and ``METHOD.gain_over_RIVAL`` of GAINS, with :class:`Where`'s tails.
 
         ``seed`` draws the scenes of the intervals.
         """
@@ -299,7 +300,7 @@ class Scores:
         seed: int = 0,
         figure: str = "psnr",
     ) -> Row | None:
-        """Gain of a method over the best of others as a row of that name; None where one is not known."""
+        """Return the gain of a method over the best of others as a named row; None if either is unknown."""
         gain = self.gain(method, over, where, figure)
         if gain is None:
             return None
@@ -309,12 +310,12 @@ class Scores:
     def mean_row(
         self, metric: str, method: str, where: Where = ALL, seed: int = 0, figure: str = "psnr"
     ) -> Row | None:
-        """Mean of a metric of a method as a row of that name; None where nothing was scored."""
+        """Return the mean of a method's metric as a named row; None if nothing was scored."""
         found = [(score.scene, score.figures[figure]) for score in self.of(method, where)]
         return mean_row(metric, UNITS[figure], found, seed) if found else None
 
     def scene_gains(self, method: str, over: Sequence[str], where: Where = ALL) -> dict[str, float]:
-        """Scene -> mean PSNR of a method minus that of the best of others in that very scene, dB."""
+        """Return scene -> mean PSNR of a method minus the PSNR of the best other method in that scene, dB."""
         means: dict[str, dict[str, float]] = {}
         for name in (method, *over):
             by_scene = defaultdict[str, list[float]](list)
@@ -331,9 +332,9 @@ class Scores:
     def _with_ranges(
         self, row: Row, method: str, over: Sequence[str], where: Where, seed: int, figure: str
     ) -> Row:
-        """The gain with its interval, in each resample over the one of the others that is the best there.
+        """Return the gain with its interval; each resample compares with the best other method in it.
 
-        Likewise where one scene is left out.
+        The range with one scene left out is computed in the same way.
         """
         by_method = [scores for name in (method, *over) if (scores := self.of(name, where))]
         sign = SIGNS[figure]

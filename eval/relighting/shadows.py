@@ -1,11 +1,11 @@
 """Errors of the surfels' shadows: light that leaks into shadow, and lit surfaces that are darkened.
 
-The definitions are those of conventions.md, 10. What is in shadow and what is lit is the path tracer's
-to say: its irradiance with shadows over its own without, so that an error of the surfels' normals moves no
-pixel from one class to another. Pixels are judged where surfels and truth show the same surface. A surfel
-that overhangs a silhouette by a pixel shows another surface, with that one's light; the error is counted
-where it belongs, in base color and the irradiance PSNR, which judge every pixel of the foreground. Same
-surface is said by distance or by normals, and both are reported.
+Definitions are in conventions.md, 10. The path tracer alone decides what is in shadow and what is lit, by its
+irradiance with shadows over its irradiance without, so errors of the surfels' normals move no pixel to
+another class. Pixels are judged where surfels and truth show the same surface. A surfel that overhangs a
+silhouette by a pixel shows another surface with another light; that error counts in base color and in the
+irradiance PSNR, which judge every pixel of the foreground. The surface is the same by distance or by normals,
+and both are reported.
 """
 
 from __future__ import annotations
@@ -35,10 +35,10 @@ class ShadowPixels(NamedTuple):
     """Pixels of one frame, (H, W) bool each.
 
     Attributes:
-        shadowed: in shadow, in the reference.
-        leaking: those of them that the surfels show too bright.
-        lit: lit, in the reference.
-        darkened: those of them that the surfels show too dark.
+        shadowed: in shadow in the reference.
+        leaking: shadowed pixels that the surfels show too bright.
+        lit: lit in the reference.
+        darkened: lit pixels that the surfels show too dark.
     """
 
     shadowed: np.ndarray
@@ -50,13 +50,13 @@ class ShadowPixels(NamedTuple):
 def shadow_pixels(
     irradiance: np.ndarray, reference: np.ndarray, unshadowed: np.ndarray, judged: np.ndarray
 ) -> ShadowPixels:
-    """Classes of pixels and errors among them, by luminance, as the constants of this file define.
+    """Classify pixels and their errors by luminance, with the constants of this file.
 
     Args:
         irradiance: (H, W, 3) linear E / pi of the surfels, with shadows.
-        reference: (H, W, 3) the path tracer's.
-        unshadowed: (H, W, 3) the path tracer's with nothing in the way.
-        judged: (H, W) bool, the pixels where both see a surface; the mean reference is taken over them.
+        reference: (H, W, 3) irradiance by the path tracer.
+        unshadowed: (H, W, 3) irradiance by the path tracer without occlusion.
+        judged: (H, W) bool, pixels where both see a surface; the mean reference is over these.
     """
     ours, truth, open_sky = (luminance(image) for image in (irradiance, reference, unshadowed))
     share = np.divide(truth, open_sky, out=np.ones_like(truth), where=open_sky > 0)
@@ -67,23 +67,23 @@ def shadow_pixels(
 
 
 def frame_shadow_pixels(frame: dict[str, np.ndarray], judged: np.ndarray) -> ShadowPixels:
-    """The same of a frame with reference members, (H, W, C) each."""
+    """Return ShadowPixels of a frame with reference members, (H, W, C) each."""
     return shadow_pixels(frame["irradiance"], frame["irradiance_ref"], frame["unshadowed_ref"], judged)
 
 
 def both_have_surface(frames: dict[str, np.ndarray]) -> np.ndarray:
-    """Pixels where truth and surfels have a surface: (..., H, W) bool, from ``foreground`` and ``mask``."""
+    """Return pixels where truth and surfels have a surface: (..., H, W) bool."""
     return (frames["foreground"][..., 0] > 0.5) & (frames["mask"][..., 0] > 0.5)
 
 
 def same_depth(frames: dict[str, np.ndarray]) -> np.ndarray:
-    """Of those the ones where it is the same surface by its distance, from ``depth`` and ``depth_ref``."""
+    """Return pixels where both have the same surface by distance, from ``depth`` and ``depth_ref``."""
     apart = np.abs(frames["depth"] - frames["depth_ref"])[..., 0]
     return both_have_surface(frames) & (apart < SAME_DEPTH)
 
 
 def same_normal(frames: dict[str, np.ndarray]) -> np.ndarray:
-    """Of those the ones where it is the same surface by its normal, from ``normal`` and ``normal_ref``."""
+    """Return pixels where both have the same surface by normal, from ``normal`` and ``normal_ref``."""
     ours, truth = frames["normal"], frames["normal_ref"]
     cosine = (ours * truth).sum(-1)
     lengths = np.linalg.norm(ours, axis=-1) * np.linalg.norm(truth, axis=-1)

@@ -1,1 +1,1 @@
-"""The neural renderer, measured: `tron-eval benchmark=renderer`."""
+"""Benchmark of the neural renderer: `tron-eval benchmark=renderer`."""

@@ -1,4 +1,4 @@
-"""Benchmark `renderer`: the shipped checkpoints against the best that there is without them."""
+"""Benchmark `renderer`: the shipped checkpoints against the best methods without them."""
 
 from __future__ import annotations
 
@@ -59,7 +59,7 @@ FEW = "few_"
 
 
 class Renderer(RendererSettings):
-    """Parts of the benchmark; data sets and trainings that are finished are not made again."""
+    """The benchmark; finished data sets and trainings are reused."""
 
     def check(self) -> None:
         """Find the commands and the data sets, and read the checkpoints."""
@@ -73,7 +73,7 @@ class Renderer(RendererSettings):
                 log.warning("no rows of %s: it wants %s", row.title, row.mend)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each figure.
+        """Measure part by part; write one line per figure to stderr.
 
         Raises:
             StageFailed: a command failed.
@@ -97,9 +97,9 @@ class Renderer(RendererSettings):
 
 
 class Run:
-    """Parts by name. Data sets are made when a part first needs them, and kept.
+    """One method for each part. Data sets are made when a part first needs them, and kept.
 
-    A part whose data are not there is left out, and the log says what is missing.
+    A part without its data is left out, and the log says what is missing.
     """
 
     def __init__(self, settings: Renderer, folder: Path):
@@ -110,16 +110,16 @@ class Run:
 
     @cached_property
     def networks(self) -> dict[str, Network]:
-        """The checkpoints by their names among the methods."""
+        """The checkpoints, by method name."""
         return load_networks("neural", self.settings.weights())
 
     def synthetic(self) -> None:
-        """Gains on held-out scenes and lights."""
+        """Measure gains on held-out scenes and lights."""
         sizes = {size: self.datasets.synthetic(size) for size in self.settings.synthetic}
         self._judge("synthetic", "", sizes, TEST, FIT)
 
     def models(self) -> None:
-        """Gains on real models at every size and quality; of the largest frames also with few surfels."""
+        """Measure gains on real models at every size and quality; largest frames also with few surfels."""
         largest, scores = max(self.settings.models), dict[bool, Scores]()
         for size in self.settings.models:
             made: dict[tuple[bool, Quality], Path] = {
@@ -140,7 +140,7 @@ class Run:
             self.outcome.add([row] if row else [])
 
     def _models_of(self, size: int, quality: Quality, few: bool, dataset: Path, truths: Truths) -> Judged:
-        """Rows of one size, quality and number of surfels; pictures of the largest as they are by default."""
+        """Add rows of one size, quality and number of surfels; show largest frames with default surfels."""
         first = size == min(self.settings.models) and quality == "preview"
         network = self.networks.get(NEURAL_LIT.name)
         identity = None if network is None else Identity(network, truths.linear)
@@ -158,23 +158,23 @@ class Run:
         return judged
 
     def captures(self) -> None:
-        """Gains on captures, reconstructed and relit."""
+        """Measure gains on captures, reconstructed and relit."""
         dataset = self.datasets.captures()
         width = next(iter(read_clips(dataset, TEST_RELIT, ()))).meta.width
         self._judge("captures", "capture_", {width: dataset}, TEST_RELIT, FIT_RELIT)
 
     def clips(self) -> None:
-        """Flicker of averages along the motion over single frames."""
+        """Measure the flicker of averages along the motion over the flicker of single frames."""
         dataset = self.datasets.synthetic(next(iter(self.settings.synthetic)))
         measure_clips(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
 
     def shadows(self) -> None:
-        """Whether shadows move as the truth's do."""
+        """Compare moving shadows with the true ones."""
         dataset = self.datasets.shadows()
         measure_shadows(dataset, TEST, self._by_kind(), self.settings.seed, self.outcome)
 
     def validation(self) -> None:
-        """Gains that checkpoint=auto goes by, of the network that starts from lit and of its rival there."""
+        """Measure the gains for checkpoint=auto, of the network that starts from lit and of its rival."""
         if network := self.networks.get(NEURAL_LIT.name):
             for size in self.settings.validation:
                 dataset = self.datasets.validation(size)
@@ -184,14 +184,14 @@ class Run:
         return {kind: self.networks[name] for name, kind in KINDS.items() if name in self.networks}
 
     def _judge(self, name: str, prefix: str, sizes: Mapping[int, Path], split: str, fit_split: str) -> None:
-        """Gains on one distribution; figures without a size are of the first, pictures of the largest."""
+        """Measure gains on one distribution; figures without a size use the first, pictures the largest."""
         judged = {size: self._judged(dataset, split, fit_split) for size, dataset in sizes.items()}
         self._add(prefix, judged)
         self.gains += over_lit(next(iter(judged.values())).scores, self.settings.seed)
         self._show(name, max(judged), judged[max(judged)], name)
 
     def _add(self, prefix: str, judged: Mapping[int, Judged], every_size: bool = False) -> None:
-        """Rows of one distribution; every_size: as of `gain_rows`."""
+        """Add rows of one distribution; ``every_size`` as in `gain_rows`."""
         scores = {size: each.scores for size, each in judged.items()}
         self.outcome.add(gain_rows(prefix, scores, self.settings.seed, every_size))
         for size, each in judged.items():
@@ -210,9 +210,10 @@ class Run:
         per_pixel: bool = True,
         identity: Identity | None = None,
     ) -> Judged:
-        """Every method on one data set, materials too; per_pixel: whether per-pixel networks learn it.
+        """Judge all methods on a data set, materials too; ``per_pixel``: train per-pixel networks on it.
 
-        Truths are the mean of all renders, and tell sharpness; identity joins the clips.
+        The truth is the mean of all renders, which also give sharpness; identity is measured on the same
+        clips.
         """
         paths = self.datasets.pixel_mlps(dataset, fit_split) if per_pixel else []
         trained = [load_networks("pixel_mlp", [path]) for path in paths]
@@ -233,11 +234,10 @@ class Run:
 
 
 def fitted(dataset: Path, split: str, fit_split: str, seed: int) -> dict[str, dict[str, Show]]:
-    """Scene of a split -> baseline -> the method as fitted for it, on the very distribution that judges.
+    """Return scene of a split -> baseline -> fitted method; fits use the distribution of the test.
 
-    Where the data set has a training split the fits are made on it. Otherwise the scenes are divided into
-    groups, and each group is judged by fits on the others, so that no baseline has seen the scene that it is
-    judged by.
+    If the data set has a training split, fits use it. Otherwise the scenes are divided into groups, and each
+    group is judged by fits on the other groups, so that no baseline was fitted on the scene of its test.
 
     Raises:
         TronError: the data set lacks the split, or has neither a training split nor two scenes.
@@ -264,7 +264,7 @@ def fitted(dataset: Path, split: str, fit_split: str, seed: int) -> dict[str, di
 
 
 def fold(scenes: list[str], folds: int, seed: int) -> list[list[str]]:
-    """Scenes in random groups of nearly one size, as many as asked for or as there are scenes."""
+    """Divide scenes into random groups of nearly equal size; there are at most as many groups as scenes."""
     order = generator(seed, "eval", "folds").permutation(len(scenes))
     count = min(folds, len(scenes))
     return [[scenes[k] for k in np.sort(order[start::count])] for start in range(count)]

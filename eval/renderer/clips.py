@@ -1,4 +1,4 @@
-"""Clips: what averaging along the motion brings: flicker and PSNR."""
+"""Flicker and PSNR of frames averaged along the motion of clips."""
 
 from __future__ import annotations
 
@@ -45,7 +45,7 @@ DEPTH = "depth_ref"
 
 @dataclass(frozen=True)
 class ClipScore:
-    """One clip by one method: its warping error, and the PSNR of each of its frames in dB (foreground)."""
+    """One clip by one method: its warping error, and the foreground PSNR of each frame in dB."""
 
     scene: str
     warping: Difference
@@ -57,10 +57,10 @@ Scored = Mapping[str, Sequence[ClipScore]]
 
 
 def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
-    """Root mean square of the warping error of every method; ratios and gains of averages over single frames.
+    """Yield RMS warping errors of methods, and ratios and gains of averages over single frames.
 
-    Figures without a checkpoint's name are of that which starts from lit, the default of tron-relight, whose
-    averages are compared with lit that is averaged alike, too.
+    Figures without a checkpoint's name are of the checkpoint that starts from lit, tron-relight's default.
+    Its averages are also compared with averages of lit.
     """
     for method, found in scores.items():
         mean = sum(each.warping.squared for each in found) / sum(each.warping.pixels for each in found)
@@ -78,7 +78,7 @@ def clip_rows(scores: Scored, kinds: Sequence[str], seed: int) -> Iterator[Row]:
 
 
 def _ratio(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], seed: int) -> Row:
-    """Mean square over that of single frames: the pixels are the same."""
+    """Divide a mean square by the mean square of single frames on the same pixels."""
     sums = np.array([[a.warping.squared, b.warping.squared] for a, b in zip(many, single)])
 
     def ratio(sums: np.ndarray) -> np.ndarray:
@@ -89,7 +89,7 @@ def _ratio(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], 
 
 
 def _gain(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], seed: int) -> Row:
-    """Mean difference of PSNR on the same frames."""
+    """Return the mean difference of PSNR on the same frames."""
     found = [(a.scene, x - y) for a, b in zip(many, single) for x, y in zip(a.psnr, b.psnr)]
     return mean_row(metric, "dB", found, seed)
 
@@ -97,10 +97,10 @@ def _gain(metric: str, many: Sequence[ClipScore], single: Sequence[ClipScore], s
 def measure_clips(
     dataset: Path, split: str, networks: Mapping[str, Network], seed: int, outcome: Outcome
 ) -> None:
-    """Render every clip by single frames, averaged too; films are of the one that flickers most.
+    """Render every clip by single frames and by their averages; film the clip that flickers most.
 
     Raises:
-        TronError: no clip has as many frames as are averaged, or clips hold no true depth.
+        TronError: no clip has enough frames to average, or clips have no true depth.
     """
     scores: defaultdict[str, list[ClipScore]] = defaultdict(list)
     worst, films = 0.0, None
@@ -136,13 +136,13 @@ def measure_clips(
 
 
 def _averaged(frames: np.ndarray, buffers: Buffers) -> np.ndarray:
-    """Pictures averaged along the motion of their clip, as tron-relight does."""
+    """Average pictures along the motion of their clip, as tron-relight does."""
     assert buffers.motion is not None  # the clip was read with the depth of its surfels
     return np.stack(list(averaged_frames(frames, len(frames), WINDOW, buffers.motion, "anchor")))
 
 
 def _films(title: str, kind: str, shown: Mapping[str, np.ndarray]) -> Films:
-    """A clip by lit, by a network's single frames and their averages, and its truth."""
+    """Film a clip by lit, by a network's single frames, by their averages, and the truth."""
     words = PLAIN | {f"{kind}.{way}": f"{KIND_TITLES[kind]}, {said}" for way, said in WAYS.items()}
     films = []
     for method in (LIT, f"{kind}.{SINGLE}", f"{kind}.{AVERAGED}", TRUTH):
@@ -159,10 +159,10 @@ def _films(title: str, kind: str, shown: Mapping[str, np.ndarray]) -> Films:
 
 
 def clip_steps(clip: Clip) -> list[Step]:
-    """Steps of a clip with true depth from each frame's foreground to the frame before.
+    """Return steps of a clip with true depth from each frame's foreground to the previous frame.
 
     Raises:
-        TronError: the clip holds no true depth, or does not say how its object moves.
+        TronError: the clip has no true depth, or no motion of its object.
     """
     if DEPTH not in clip.frames:
         raise TronError(

@@ -37,95 +37,97 @@ Quality = Literal["preview", "final"]
 
 
 class CaptureRecipes(BaseModel):
-    """Captures whose truth is hidden, and their reconstructions under other lights."""
+    """Settings: captures with hidden truth, and their reconstructions under other lights."""
 
     model_config = ConfigDict(frozen=True, extra="forbid")
 
-    views: Recipe = Field(description="arguments of tron-datagen: photographs, and the truth relit beside")
-    pairs: Recipe = Field(description="those that reconstruct the photographs and relight what comes of it")
+    views: Recipe = Field(description="arguments of tron-datagen that make photographs and relit truth")
+    pairs: Recipe = Field(
+        description="arguments of tron-datagen that reconstruct the photographs and relight the result"
+    )
 
 
 class RendererSettings(Benchmark):
-    """Checkpoints, recipes and sizes of the parts; recipes are arguments of the other commands."""
+    """Settings: checkpoints, recipes and sizes of the parts; recipes are arguments of other commands."""
 
     name: ClassVar[str] = "renderer"
 
-    parts: list[Part] = Field(description="what is measured", min_length=1)
-    seed: int = Field(default=0, description="seed of the fits and the intervals")
-    threads: PositiveInt = Field(default=1, description="threads that the networks use")
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
+    seed: int = Field(default=0, description="seed of the fits and of the confidence intervals")
+    threads: PositiveInt = Field(default=1, description="CPU threads of the networks")
     renderer: Path | list[Path] | None = Field(
         default=None,
-        description="checkpoint that is judged: a file or a shipped name; [a,b]: one with lit, one of the "
-        "paper's two buffers; null: both that are shipped",
+        description="checkpoint to judge: a file or a shipped name; [a,b]: one with lit, one of the paper's "
+        "two buffers; null: both shipped checkpoints",
     )
     data: dict[str, Path] = Field(
         default={},
-        description="data sets that are there already, by the names that this benchmark gives its own: "
+        description="existing data sets, under the names of this benchmark's own: "
         "synthetic_128, models_128_preview, models_512_few_final, captures, shadows",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
-    real_data: Path | None = Field(description="folder with assets and hdri; null: no models")
-    models: Sizes = Field(description="width of a frame -> recipe of scenes of those models")
+    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no models")
+    models: Sizes = Field(description="width of a frame -> recipe of scenes of the models")
     qualities: dict[Quality, Recipe] = Field(
-        description="quality of tron-relight -> what it adds to the recipes of models; each has another "
-        "path_spp, with other passes, so that the truth is rendered twice",
+        description="quality of tron-relight -> further arguments for the recipes of models; path_spp "
+        "differs in each, so that the truth is rendered twice",
         min_length=1,
     )
     few_surfels: Recipe | None = Field(
         default=None,
-        description="what is added to that for the largest frames, made again with as few surfels as small "
-        "frames have; null: without them",
+        description="further arguments to make the largest frames again with as few surfels as small "
+        "frames have; null: not made",
     )
-    captures: CaptureRecipes = Field(description="held-out captures")
-    shadows: Recipe = Field(description="clips in which an occluder moves")
+    captures: CaptureRecipes = Field(description="recipes of held-out captures")
+    shadows: Recipe = Field(description="recipe of clips with a moving occluder")
     validation: Sizes = Field(
-        description="width of a frame -> recipe of scenes that checkpoint=auto of tron-relight goes by"
+        description="width of a frame -> recipe of validation scenes for checkpoint=auto of tron-relight"
     )
     pixel_mlp: Recipe | None = Field(
         default=None,
-        description="arguments of tron-train for the per-pixel baselines, trained on the training split of "
-        "each test distribution that has one; null: without them",
+        description="arguments of tron-train for per-pixel baselines on the training split of each test "
+        "distribution that has one; null: no such baselines",
     )
-    pictures: NonNegativeInt = Field(default=3, description="scenes of each distribution that are shown")
+    pictures: NonNegativeInt = Field(default=3, description="number of scenes per distribution on the page")
 
     def weights(self) -> list[Path]:
-        """Files of the checkpoints."""
+        """Return the files of the checkpoints."""
         given = [self.renderer] if isinstance(self.renderer, Path) else self.renderer
         return [find_weights(each) for each in given or ("paper", "surfaces")]
 
 
 class Datasets:
-    """Data sets by name, made on first use; what is finished is not made again.
+    """Data sets by name, made on first use; finished ones are reused.
 
     Args:
-        settings: of the benchmark.
-        folder: for all of them, absolute.
+        settings: settings of the benchmark.
+        folder: absolute folder of all data sets.
 
-    Every method raises StageFailed where a command fails, and TronError where the folder was begun with
-    other settings.
+    Every method raises StageFailed if a command fails, and TronError if the folder was begun with other
+    settings.
     """
 
     def __init__(self, settings: RendererSettings, folder: Path):
         self.settings, self.folder, self.stages = settings, folder, Stages(folder)
 
     def synthetic(self, size: int) -> Path:
-        """Held-out scenes and lights."""
+        """Return the data set of held-out scenes and lights."""
         return self._made(f"synthetic_{size}", self.settings.synthetic[size])
 
     def models(self, size: int, quality: Quality, few: bool = False) -> Path | None:
-        """Scenes of the user's models; None where there are none. few: of few surfels."""
+        """Return scenes of the user's models; None without models. ``few``: with few surfels."""
         name, data = models_name(size, quality, few), self.settings.real_data
         if name in self.settings.data:
             return self.settings.data[name]
         if data is None or not all((data / kind).is_dir() for kind in ("assets", "hdri")):
-            log.warning("no assets and hdri in %s: no models", data)
+            log.warning("no models: give benchmark.real_data=FOLDER with assets and hdri")
             return None
         recipe = [*self.settings.models[size], *self.settings.qualities[quality]]
         recipe += (self.settings.few_surfels or ()) if few else ()
         return self._made(name, [*recipe, *model_arguments(data)])
 
     def captures(self) -> Path:
-        """Held-out captures, reconstructed and relit."""
+        """Return held-out captures, reconstructed and relit."""
         if "captures" in self.settings.data:
             return self.settings.data["captures"]
         recipes = self.settings.captures
@@ -134,15 +136,15 @@ class Datasets:
         return self._made("captures", [*recipes.pairs, *given])
 
     def shadows(self) -> Path:
-        """Clips in which an occluder moves."""
+        """Return clips with a moving occluder."""
         return self._made("shadows", self.settings.shadows)
 
     def validation(self, size: int) -> Path:
-        """Scenes that nothing is judged by."""
+        """Return the validation scenes, on which nothing is judged."""
         return self._made(f"validation_{size}", self.settings.validation[size])
 
     def pixel_mlps(self, dataset: Path, split: str) -> list[Path]:
-        """Weights of per-pixel baselines trained on a split; none where they are not asked for."""
+        """Return weights of per-pixel baselines trained on a split; none if the recipe is null."""
         recipe = self.settings.pixel_mlp
         if recipe is None or split not in Manifest.load(dataset).splits():
             return []
@@ -167,12 +169,12 @@ class Datasets:
 
 
 def models_name(size: int, quality: Quality, few: bool) -> str:
-    """Name of a data set of models."""
+    """Return the name of a data set of models."""
     return f"models_{size}{'_few' if few else ''}_{quality}"
 
 
 def require_data(settings: RendererSettings) -> None:
-    """TronError unless every folder that was given holds a data set, and is given for one that is made."""
+    """Raise TronError unless every given folder has a data set, under a name of this benchmark."""
     known = [f"synthetic_{size}" for size in settings.synthetic]
     known += [
         models_name(size, quality, few)
@@ -201,12 +203,12 @@ PLAIN = re.compile(r"[A-Za-z][\w./-]*")
 
 
 def model_names(data: Path) -> list[str]:
-    """Names of its models, sorted."""
+    """Return the names of a folder's models, sorted."""
     return _names(data / "assets", MODEL_FILES)
 
 
 def model_arguments(data: Path) -> list[str]:
-    """Arguments that give a run the models and maps, licensed or not: what is judged is not handed on."""
+    """Return arguments with models and maps, of any licence: the data sets are not published."""
     data = data.absolute()
     names = [*model_names(data), *_names(data / "hdri", MAP_FILES)]
     return [
@@ -217,7 +219,7 @@ def model_arguments(data: Path) -> list[str]:
 
 
 def typed_list(names: Sequence[str]) -> str:
-    """Names as one types them in a list; in quotation marks where they have spaces, or could be numbers."""
+    """Format names as a typed list; names with spaces, or that look like numbers, are quoted."""
     return f"[{','.join(name if PLAIN.fullmatch(name) else _quoted(name) for name in names)}]"
 
 
@@ -227,9 +229,9 @@ def _quoted(name: str) -> str:
 
 
 def _names(folder: Path, suffixes: Sequence[str]) -> list[str]:
-    """Names of a folder's files as tron-datagen calls them, with its subfolders, suffixes in any case.
+    """Return the names of a folder's files for tron-datagen, subfolders included, suffixes in any case.
 
-    A file is called by its stem, or where several have that, by its path without the suffix.
+    The name is the stem, or the path without the suffix if several files share the stem.
     """
     paths = [path.relative_to(folder) for path in folder.rglob("*") if path.suffix.lower() in suffixes]
     stems = Counter(path.stem for path in paths)

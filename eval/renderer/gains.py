@@ -1,9 +1,9 @@
 """Gains of the checkpoints on one test distribution, at one or more sizes of its frames.
 
-The paper's pair is held against the best baseline of direct light: those that see pbr and irradiance alone
-and, harder, those that are also given irradiance without shadows and shading with them, from which the pair
-was made. ``over_two_buffers`` is the gain over the former alone. The network that starts from lit is held
-against lit and all fits on it.
+The network of the paper's two buffers is compared with the best baseline of direct light: baselines of pbr
+and irradiance alone and, harder, baselines that also see unshadowed irradiance and shadowed shading, from
+which the two buffers are made. ``over_two_buffers`` is the gain over the former alone. The network that
+starts from lit is compared with lit and all fits on it.
 """
 
 from __future__ import annotations
@@ -46,13 +46,13 @@ WORST_OVER = {f"worst_scene_over_{name}_db": [each.name] for name, each in DENOI
 
 
 def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: bool = False) -> Iterator[Row]:
-    """Gains, PSNRs and SSIMs, overall and by family and style, of the foreground and of full frames.
+    """Yield gains, PSNRs and SSIMs, overall and by family and style, for foreground and full frames.
 
     Args:
-        prefix: before the word gain in names of rows: "", "ood_", "final_" or "capture_".
+        prefix: prefix of the word gain in names of rows: "", "ood_", "final_" or "capture_".
         sizes: width of a frame -> scores.
         seed: draws the scenes of the intervals.
-        every_size: whether all names hold their size; otherwise those of the first do not.
+        every_size: whether all names hold their size; otherwise names of the first size do not.
     """
     for size, scores in sizes.items():
         known = {each.name for each in scores.methods}  # per-pixel networks are not always trained
@@ -77,11 +77,11 @@ def gain_rows(prefix: str, sizes: Mapping[int, Scores], seed: int, every_size: b
 
 
 def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """What single scenes make of the gain over the best rival, foreground.
+    """Yield the spread over single scenes of the foreground gain over the best rival.
 
-    The gain without the scene that raises it most, and the share of it that this keeps (0 where there is no
-    gain); the least gain of a scene over the rival that is the best there, over what the network starts
-    from, and, with lit, over each denoiser.
+    Rows are the gain without the scene that raises it most, and the share of the gain that remains (0 without
+    gain); and the least gain of a scene over the scene's best rival, over the network's start picture and,
+    with lit, over each denoiser.
     """
     for method, (start, rivals) in RIVALS.items():
         known = {each.name for each in scores.methods}
@@ -106,7 +106,7 @@ def scene_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Ro
 
 
 def seen_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """SSIM and FLIP, which do not pay for blur as PSNR does: of every method, gains over the best by each."""
+    """Yield SSIM and FLIP of every method, and gains; unlike PSNR these do not reward blur."""
     known = {each.name: scores.of(each.name, Where()) for each in scores.methods}
     for figure in ("ssim", "flip"):
         if not all(figure in score.figures for found in known.values() for score in found):
@@ -123,10 +123,10 @@ def seen_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row
 
 
 def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator[Row]:
-    """Of metals and of the rest by themselves, over frames that have both, or one: PSNRs and gains.
+    """Yield PSNRs and gains on metals and on other materials, over frames that have them.
 
-    What carries a mean is seen: ``rest`` is the gain without metals. PSNRs are those of the networks, lit and
-    denoisers.
+    ``rest`` is the gain without metals, so it shows whether metals carry the mean. PSNRs are of the networks,
+    lit and denoisers.
     """
     known = {each.name for each in scores.methods}
     for where in map(Where, MATERIALS):
@@ -142,7 +142,7 @@ def material_rows(prefix: str, scores: Scores, tail: str, seed: int) -> Iterator
 
 
 def between(metric: str, method: str, scores: Scores, other: Scores, seed: int) -> Row | None:
-    """PSNR of a method minus that of the same on other data of the same frames; None where not scored.
+    """Return a method's PSNR minus its PSNR on other data of the same frames; None if not scored.
 
     Raises:
         TronError: the frames differ.
@@ -163,14 +163,14 @@ def between(metric: str, method: str, scores: Scores, other: Scores, seed: int) 
 
 
 def time_rows(prefix: str, seconds: Mapping[str, Sequence[float]], size: int) -> Iterator[Row]:
-    """Median seconds of a frame by every method that was timed, guidance given."""
+    """Yield median seconds per frame of every timed method, without making the guidance."""
     for method, found in seconds.items():
         name = f"renderer.{prefix}seconds.{method.replace('.', '_')}.{size}"
         yield Row(metric=name, value=float(np.median(found)), unit="s", n=len(found))
 
 
 def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
-    """The least of each row on single scenes of the network that starts from lit, of all that was judged."""
+    """Yield the least of each single-scene row of the network that starts from lit, over all data."""
     found = list(rows)
     for end in (WORST, WORST_OVER_INPUT, *WORST_OVER, KEPT):
         pattern = re.compile(rf"renderer\.lit\.([a-z]+_)*{end}(\.\d+)?")
@@ -180,7 +180,7 @@ def everywhere(rows: Iterable[Row]) -> Iterator[Row]:
 
 
 def over_lit(scores: Scores, seed: int) -> list[Row]:
-    """Gains over lit of the network that starts from it, by family or style, foreground."""
+    """Return foreground gains over lit of the network that starts from lit, by family or style."""
     parts = [each for each in places(scores) if each.region == "foreground"]
     kinds = [each for each in parts if each.family or each.style] or parts
     rows = (scores.gain_row("renderer.lit.any", NEURAL_LIT.name, ["lit"], where, seed) for where in kinds)
@@ -188,7 +188,7 @@ def over_lit(scores: Scores, seed: int) -> list[Row]:
 
 
 def places(scores: Scores) -> list[Where]:
-    """Everything; each kind of light, where there are two or more; each style: of both regions."""
+    """Return for both regions: all clips, each light family if there are several, and each style."""
     families = scores.families if len(scores.families) > 1 else []
     kinds = [(family, None) for family in (None, *families)] + [(None, style) for style in scores.styles]
     return [Where(region, family, style=style) for family, style in kinds for region in REGIONS]

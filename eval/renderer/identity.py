@@ -1,7 +1,7 @@
-"""What a network makes of a picture that is right: it is given the truth in place of ``lit``.
+"""Identity error of a network: its PSNR when its input is the truth in place of ``lit``.
 
-A truth of few paths has noise, and who takes that out is marked down: of 64 paths at 128 x 128 Open Image
-Denoise keeps 40 dB, 33 to 35 in the noisiest scene. The mean of several renders has less.
+A truth of few samples has noise, and a network that removes it scores lower: of 64 samples at 128 x 128, Open
+Image Denoise keeps 40 dB, 33 to 35 in the noisiest scene. The mean of several renders has less noise.
 """
 
 from __future__ import annotations
@@ -24,11 +24,11 @@ _JUDGED = re.compile(rf"renderer\.([a-z]+_)+{NAME}\.\d+")
 
 @dataclass
 class Identity:
-    """PSNR of what a network returns of the truth, foreground.
+    """Foreground PSNR of a network's output for the truth as input.
 
     Attributes:
-        network: that starts from lit.
-        truth: of a clip, (K, H, W, 3) linear.
+        network: network that starts from lit.
+        truth: function of a clip that returns its truth, (K, H, W, 3) linear.
     """
 
     network: Network
@@ -36,7 +36,7 @@ class Identity:
     found: list[tuple[str, float]] = field(default_factory=list, init=False)
 
     def add(self, clip: Clip) -> None:
-        """Judge the frames of a clip; its other buffers are as they are."""
+        """Judge the frames of a clip; the other buffers are unchanged."""
         buffers = Buffers({**clip.frames, "lit": self.truth(clip)}, clip.meta.exposure)
         shown, right = self.network.show(buffers), buffers.displayed("lit")
         for image, truth, inside in zip(shown, right, region_mask(clip, "foreground")):
@@ -44,15 +44,16 @@ class Identity:
                 self.found.append((clip.meta.scene, metrics.capped_psnr(image, truth, inside)))
 
     def rows(self, start: str, tail: str, seed: int) -> list[Row]:
-        """Its mean over frames, dB; none where nothing was judged.
+        """Return rows of the mean over frames, dB; none if nothing was judged.
 
-        ``start`` stands before the figure's name, ``tail`` after it; ``seed`` draws the intervals' scenes.
+        ``start`` is the prefix of the figure's name, ``tail`` the suffix; ``seed`` draws the intervals'
+        scenes.
         """
         return [mean_row(f"{start}{NAME}{tail}", "dB", self.found, seed)] if self.found else []
 
 
 def least_identity(rows: Iterable[Row]) -> Iterator[Row]:
-    """The least of what was judged, of all sizes and qualities: ``renderer.identity_psnr``.
+    """Yield the least figure over all sizes and qualities: ``renderer.identity_psnr``.
 
     Validation is left out: its truths are single renders.
     """

@@ -1,4 +1,4 @@
-"""Pictures in which a person sees the difference: frames side by side, and an inset where it is largest."""
+"""Pictures for people: frames side by side, with an inset where they differ most."""
 
 from __future__ import annotations
 
@@ -27,7 +27,7 @@ COLUMNS = (
 
 
 def comparison(example: Example) -> Pictures:
-    """Guidance, lit, its best Gaussian, the networks and the truth of one frame, each above its inset."""
+    """Show guidance, lit, its best Gaussian, the networks and the truth of one frame, each with its inset."""
     where = f"scene {example.meta.scene} under light {example.meta.light}"
     images = {**example.methods, "irradiance": example.irradiance}
     shown = [(name, title) for name, title in COLUMNS if name in images]
@@ -50,7 +50,7 @@ def comparison(example: Example) -> Pictures:
 
 
 def busiest_square(a: np.ndarray, b: np.ndarray) -> tuple[tuple[int, int], int]:
-    """Upper left corner (row, column) and side of the square in which two (H, W, 3) images differ most."""
+    """Return corner (row, column) and side of the square in which two images (H, W, 3) differ most."""
     height, width = a.shape[:2]
     side = max(min(height, width) // ZOOM, 1)
     error = uniform_filter(((a - b) ** 2).sum(-1), side, mode="constant", origin=-(side // 2))
@@ -60,7 +60,7 @@ def busiest_square(a: np.ndarray, b: np.ndarray) -> tuple[tuple[int, int], int]:
 
 
 def with_inset(image: np.ndarray, corner: tuple[int, int], side: int) -> np.ndarray:
-    """The image (H, W, 3) with the square marked, and the square enlarged to its width below it."""
+    """Return the image (H, W, 3) with the square marked, and the square enlarged below it."""
     row, column = corner
     scale = -(-LEAST_WIDTH // image.shape[1])
     marked = enlarge(image, scale)
@@ -79,5 +79,5 @@ def with_inset(image: np.ndarray, corner: tuple[int, int], side: int) -> np.ndar
 
 
 def enlarge(image: np.ndarray, scale: int) -> np.ndarray:
-    """Every pixel as a square of ``scale`` pixels; a copy."""
+    """Return a copy with every pixel as a square of ``scale`` x ``scale`` pixels."""
     return image.repeat(scale, 0).repeat(scale, 1)

@@ -1,9 +1,9 @@
-"""Shadows that move: whether the network's picture changes where the truth's does, and by as much.
+"""Moving shadows: compare the change of a network's picture with the change of the truth.
 
-An occluder moves between two frames, camera and light stand still. Where the surface stayed, what changes
-is the light that arrives. x is the truth's change of a displayed value, y that of a method. Correlation is
-Pearson's; the slope is that of the least-squares line of y over x, cov(x, y) / var(x). Both follow from
-sums over pixels.
+An occluder moves between two frames, camera and light stand still. Where the surface stayed, only the
+incoming light changes. x is the change of a display value in the truth, y the change by a method. Correlation
+is Pearson's; the slope is of the least-squares line of y over x, cov(x, y) / var(x). Both follow from sums
+over pixels.
 """
 
 from __future__ import annotations
@@ -46,11 +46,11 @@ def measure_shadows(
 ) -> None:
     """Compare consecutive frames of every clip: correlation and slope of every method.
 
-    Figures without a name are of the checkpoint that starts from lit, the default of tron-relight. The pair
-    of frames that changes most is shown.
+    Figures without a name are of the checkpoint that starts from lit, tron-relight's default. The pair of
+    frames that changes most is shown.
 
     Raises:
-        TronError: clips hold no references, or no surface stays where the truth changes.
+        TronError: clips have no references, or no surface stays where the truth changes.
     """
     scenes, sums, largest = list[str](), defaultdict[str, list[np.ndarray]](list), 0.0
     pictures = None
@@ -96,7 +96,7 @@ def measure_shadows(
 
 
 def _pictures(title: str, pairs: Mapping[str, tuple[np.ndarray, np.ndarray]], judged: np.ndarray) -> Pictures:
-    """Two frames and their change where ``judged`` (H, W), a method a row."""
+    """Show two frames and their change at pixels ``judged`` (H, W), one row per method."""
     pictures, scale = [], -(-LEAST_WIDTH // judged.shape[1])
     titles = {LIT: "lit, no network", **KIND_TITLES, "truth": "path-traced truth"}
     for name, (before, now) in pairs.items():
@@ -129,26 +129,26 @@ def stayed(frames: Mapping[str, np.ndarray], before: int, now: int) -> np.ndarra
 
 
 def change_sums(truth: np.ndarray, ours: np.ndarray) -> np.ndarray:
-    """(6,) float64: n and sums of x, y, xx, xy, yy over values of any shape."""
+    """Return n and the sums of x, y, xx, xy, yy over values of any shape: (6,) float64."""
     x, y = (np.asarray(each, np.float64).ravel() for each in (truth, ours))
     return np.array([x.size, x.sum(), y.sum(), x @ x, x @ y, y @ y])
 
 
 def correlation(sums: np.ndarray) -> np.ndarray:
-    """Correlation from sums (..., 6); 0 where one side never varies."""
+    """Return the correlation from sums (..., 6); 0 if one side never varies."""
     _, var_x, var_y, cov = _moments(sums)
     spread = np.sqrt(np.maximum(var_x * var_y, 0))
     return np.divide(cov, spread, out=np.zeros_like(cov), where=spread > 1e-15)
 
 
 def slope(sums: np.ndarray) -> np.ndarray:
-    """Slope from sums (..., 6); 0 where the truth never varies."""
+    """Return the slope from sums (..., 6); 0 if the truth never varies."""
     _, var_x, _, cov = _moments(sums)
     return np.divide(cov, var_x, out=np.zeros_like(cov), where=var_x > 1e-15)
 
 
 def slope_error(sums: np.ndarray) -> np.ndarray:
-    """Distance of the slope from 1."""
+    """Return the distance of the slope from 1."""
     return np.abs(slope(sums) - 1)
 
 

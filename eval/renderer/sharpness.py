@@ -1,9 +1,9 @@
-"""Sharpness: mean squared gradient of a picture over that of the truth, of displayed values.
+"""Sharpness: mean squared gradient of a picture over the truth's, in display values.
 
-The gradient is the differences of neighbouring pixels, along rows and along columns. The truth's own is the
-mean product of the gradients of two renders of it (of every two, where there are more): their noise is
-independent, so that the product's mean is the square of what they have in common, and a truth without noise
-is what is meant. A picture's noise counts as its sharpness: read it beside the PSNR.
+The gradient is the differences of neighbouring pixels, along rows and along columns. The truth's squared
+gradient is the mean product of the gradients of two renders (of every pair, if there are more): their noise
+is independent, so the mean product estimates a truth without noise. A picture's noise counts as sharpness:
+read it beside the PSNR.
 """
 
 from __future__ import annotations
@@ -27,11 +27,11 @@ BEST_RIVAL = "best_rival"
 
 
 def gradient_product(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> float:
-    """Mean product of two pictures' differences of neighbours, along rows plus along columns.
+    """Return the mean product of two pictures' neighbour differences, along rows plus along columns.
 
     Args:
         a, b: (H, W, 3).
-        inside: (H, W) bool; pairs of neighbours count that both lie inside.
+        inside: (H, W) bool; pairs of neighbours count if both are inside.
     """
     total = 0.0
     for axis in (0, 1):
@@ -44,17 +44,17 @@ def gradient_product(a: np.ndarray, b: np.ndarray, inside: np.ndarray) -> float:
 
 @dataclass
 class Gradients:
-    """Squared gradients of a frame and of its truth, as :attr:`Scores.more`.
+    """Squared gradients of a frame and of its truth, for :attr:`Scores.more`.
 
     Attributes:
-        truths: renders of the clips; of one alone the noise is not known, and nothing is said.
+        truths: renders of the clips; clips with a single render have no figures.
     """
 
     truths: Truths
     _true: dict[tuple[str, int], float] = field(default_factory=dict, init=False, repr=False)
 
     def __call__(self, clip: Clip, number: int, image: np.ndarray, inside: np.ndarray) -> dict[str, float]:
-        """Figures of one displayed frame (H, W, 3) on the pixels ``inside`` (H, W)."""
+        """Return the figures of one displayed frame (H, W, 3) on the pixels ``inside`` (H, W)."""
         renders, place = self.truths.renders[clip.meta.key], (clip.meta.key, number)
         if len(renders) < 2:
             return {}
@@ -66,14 +66,14 @@ class Gradients:
 
 
 def sharpness_rows(prefix: str, scores: Scores, rivals: Sequence[str], tail: str, seed: int) -> Iterator[Row]:
-    """Sharpness of the network that starts from lit, of lit, of each denoiser, and of the best rival.
+    """Yield the sharpness of the network that starts from lit, of lit, each denoiser and the best rival.
 
-    And the network's over each denoiser's.
+    Rows of the network's sharpness over each denoiser's follow.
 
     Args:
-        prefix: before the word in the rows' names.
+        prefix: prefix of the word sharpness in the rows' names.
         scores: with :class:`Gradients`; without them there are no rows.
-        rivals: the best of which by PSNR is meant.
+        rivals: candidates for the best rival by PSNR.
         tail: end of the names.
         seed: draws the scenes of the intervals.
     """
@@ -99,7 +99,7 @@ def _figures(scores: Sequence[Score], name: str) -> list[float]:
 
 
 def _ratio(metric: str, scores: Sequence[Score], over: Sequence[float], seed: int) -> Iterator[Row]:
-    """Sum of squared gradients over that of others: frames of contrast say most, flat ones nothing."""
+    """Divide two sums of squared gradients: frames of contrast count most, flat ones nothing."""
     sums = np.array([_figures(scores, OWN), over]).T
     if sums[:, 1].sum() <= 0:
         return

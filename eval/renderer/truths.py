@@ -1,9 +1,9 @@
-"""Path-traced truth that was rendered more than once: its mean, and how much noise that has left.
+"""Truth from several path-traced renders: their mean, and its remaining noise.
 
-Data sets of one recipe at two qualities hold the same frames. Where they differ in the paths of a pass each
-has paths of its own (errors of 90, 100 and 110 paths in one pass correlate by 0.0 to 0.13), so that both
-renders together are a better truth than either, and their differences say how far from the expectation their
-mean still is. A perfect picture scores no more than that.
+Data sets of one recipe at two qualities have the same frames. If their samples per pass differ, their paths
+are independent (errors of 90, 100 and 110 samples in one pass correlate by 0.0 to 0.13). The mean of both
+renders is then a better truth than either, and their difference gives the remaining noise of the mean, which
+bounds the score of a perfect picture.
 """
 
 from __future__ import annotations
@@ -37,10 +37,10 @@ class Truths:
 
     @classmethod
     def of(cls, datasets: Iterable[Path], split: str) -> Truths:
-        """Those of all data sets; renders that are equal to the bit count once.
+        """Collect the renders of all data sets; bitwise equal renders count once.
 
         Raises:
-            TronError: the data sets do not hold the same frames.
+            TronError: the data sets do not have the same frames.
         """
         found, cameras = cls(), {}
         for dataset in datasets:
@@ -54,18 +54,18 @@ class Truths:
         return found
 
     def linear(self, clip: Clip) -> np.ndarray:
-        """Mean of the renders of a clip: (K, H, W, 3) linear."""
+        """Return the mean of the renders of a clip: (K, H, W, 3) linear."""
         return np.mean(self.renders[clip.meta.key], axis=0)
 
     def displayed(self, clip: Clip) -> np.ndarray:
-        """The same as displayed under its exposure, in [0, 1]."""
+        """Return the mean of the renders in display values, with the clip's exposure."""
         return displayed(TARGET, self.linear(clip), clip.meta.exposure)
 
     def rows(self, clips: Iterable[Clip], metric: str, tail: str, seed: int) -> list[Row]:
-        """PSNR that a perfect picture has against the mean, by the noise of displayed values left in it.
+        """Return rows of a perfect picture's PSNR against the mean, from the mean's noise in display values.
 
         Args:
-            clips: that are judged, with ``foreground``; those with one render say nothing.
+            clips: judged clips, with ``foreground``; clips with one render are ignored.
             metric, tail: beginning and end of the rows' name; the region's tail stands between.
             seed: draws the scenes of the intervals.
         """
@@ -89,5 +89,5 @@ class Truths:
 
 
 def mean_noise(renders: Sequence[np.ndarray]) -> np.ndarray:
-    """Estimated squared error of the mean of renders: their variance, unbiased, over their number."""
+    """Estimate the squared error of the mean of renders: their unbiased variance over their number."""
     return np.var(np.stack(renders).astype(np.float64), axis=0, ddof=1) / len(renders)

@@ -1,7 +1,7 @@
-"""What tron-relight's ``checkpoint=auto`` goes by: gains over ``lit`` on validation scenes.
+"""Gains over ``lit`` on validation scenes, from which tron-relight's ``checkpoint=auto`` chooses.
 
-They are measured by size and quality, on scenes by which no figure of the benchmark is judged, and stand in
-:mod:`tron.neural.network_gains`.
+They are measured by size and quality, on scenes outside all other figures of the benchmark, and are copied
+to :mod:`tron.neural.network_gains`.
 """
 
 from __future__ import annotations
@@ -23,11 +23,11 @@ from tron.shards.schema import TARGET
 
 
 def validation_rows(dataset: Path, split: str, network: Network, size: int, seed: int) -> Iterator[Row]:
-    """Mean gains over lit of the clips of each quality, foreground, dB; and what becomes of the truth.
+    """Yield mean foreground gains over lit for each quality, dB, and identity errors.
 
-    Of a network (``QUALITY_gain_db``) and of each denoiser that is installed and wants no more than guidance
-    (``QUALITY_oidn_gain_db``). checkpoint=auto goes by the lower ends of their intervals. ``seed`` draws the
-    scenes of those.
+    Rows are for a network (``QUALITY_gain_db``) and for each installed denoiser that needs only guidance
+    (``QUALITY_oidn_gain_db``). checkpoint=auto uses the lower ends of their intervals. ``seed`` draws the
+    scenes of the intervals.
     """
     ways: dict[str, Show] = {"": network.show}
     for name, each in DENOISED.items():

@@ -1,1 +1,1 @@
-"""Path tracers as witnesses: Mitsuba's on meshes, and Cycles in a Blender of its own."""
+"""Reference path tracers: Mitsuba on meshes, and Cycles in a separate Blender."""

@@ -1,6 +1,6 @@
-"""Blender as a witness: files of ours that it reads and renders, in a process of its own.
+"""Blender as a reference: it reads and renders our files in a separate process.
 
-Its Python is another than ours (:mod:`eval.renderers.blender_process`); a job and EXR files go between them.
+It has its own Python (:mod:`eval.renderers.blender_process`); a job file and EXR files are exchanged.
 """
 
 from __future__ import annotations
@@ -27,7 +27,7 @@ _PATIENCE = 3600
 
 
 class Seen(NamedTuple):
-    """A view by Cycles; what nothing covers is 0.
+    """A view by Cycles; uncovered pixels are 0.
 
     Attributes:
         lit: (H, W, 3) linear radiance.
@@ -43,10 +43,10 @@ class Seen(NamedTuple):
 
 
 def blender_version(python: Path) -> str:
-    """Version of the Blender that a Python has.
+    """Return the version of Blender in a Python.
 
     Raises:
-        TronError: there is no such Python, or it has none.
+        TronError: there is no such Python, or it has no Blender.
     """
     words = [str(python), "-I", "-c", "import bpy; print('blender', bpy.app.version_string)"]
     try:
@@ -71,21 +71,21 @@ def rendered(
     threads: int,
     seed: int,
 ) -> list[list[Seen]]:
-    """A glTF as Blender reads it and Cycles renders it: each light's views.
+    """Render a glTF by Cycles with Blender's importer; return each light's views.
 
     Args:
-        python: that has ``bpy``.
-        model: the file; in Blender it stands z up.
-        cameras: with square pixels and the principal point in the middle.
+        python: Python with ``bpy``.
+        model: the file; Blender imports it z up.
+        cameras: cameras with square pixels and a central principal point.
         lights: around the model.
-        folder: for the job and its frames.
-        samples: paths a pixel.
-        bounces: times that light bounces between surfaces.
-        threads: of Cycles.
-        seed: of its random numbers.
+        folder: folder of the job and its frames.
+        samples: samples per pixel.
+        bounces: bounces of light between surfaces.
+        threads: threads of Cycles.
+        seed: seed of Cycles.
 
     Raises:
-        TronError: Blender failed, with its last words.
+        TronError: Blender failed; the error has its last output.
     """
     folder.mkdir(parents=True, exist_ok=True)
     maps = [folder / f"light{number}.exr" for number in range(len(lights))]
@@ -119,7 +119,7 @@ def rendered(
 
 
 def lat_long(light: EnvironmentMap) -> np.ndarray:
-    """(H, 2H, 3) of a light by Blender's convention.
+    """Bake a light to (H, 2H, 3) in Blender's convention.
 
     Its middle column looks along +x, azimuth falls to the right, and rows are centred on half texels
     (``direction_to_equirectangular`` of Cycles).
@@ -142,7 +142,7 @@ def _told(camera: Camera) -> dict[str, object]:
 
 
 def _read(path: Path) -> Seen:
-    """Layers of a frame; :func:`tron.io.images.read_image` reads one."""
+    """Read all layers of a frame; :func:`tron.io.images.read_image` reads only one."""
     import OpenEXR
 
     held = OpenEXR.File(str(path), separate_channels=True).channels()

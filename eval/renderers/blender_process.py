@@ -1,8 +1,8 @@
-"""What Blender's own Python does: read a glTF, and render it by Cycles from given cameras under given lights.
+"""Script for Blender's Python: read a glTF, and render it by Cycles with given cameras and lights.
 
     PYTHON -I blender_process.py JOB.json
 
-PYTHON is one that has the wheel ``bpy`` (https://pypi.org/project/bpy), in an environment of its own. Frames
+PYTHON has the wheel ``bpy`` (https://pypi.org/project/bpy), in an environment of its own. Frames
 are EXR files of several layers, LIGHT_VIEW.exr beside the job: Combined (linear radiance, and alpha), Normal
 (world) and the base color. The glTF comes to stand z up, as its importer has it.
 """
@@ -41,7 +41,7 @@ def main(job: str) -> None:
 
 
 def _set_up(scene: Any, told: dict[str, Any]) -> None:
-    """Path tracing without denoising, clamping or smoothing, pixels as boxes, black behind."""
+    """Set up path tracing without denoising, clamping or smoothing; box filter, black background."""
     scene.render.engine, scene.cycles.device = "CYCLES", "CPU"
     scene.cycles.samples, scene.cycles.seed = told["samples"], told["seed"]
     scene.cycles.use_adaptive_sampling = scene.cycles.use_denoising = False
@@ -60,9 +60,9 @@ def _set_up(scene: Any, told: dict[str, Any]) -> None:
 
 
 def _prepare(tree: Any, name: str) -> None:
-    """Leave a material what ours has, and let it put out its base color.
+    """Reduce a material to our model, and output its base color.
 
-    It is opaque or clear, as alpha is above one half or below, and has no clear coat.
+    Alpha above one half is opaque, below it is clear; there is no clear coat.
     """
     principled = next((node for node in tree.nodes if node.type == "BSDF_PRINCIPLED"), None)
     if principled is None:
@@ -88,7 +88,7 @@ def _prepare(tree: Any, name: str) -> None:
 
 
 def _light(scene: Any, path: str) -> None:
-    """A lat-long picture around the scene, as it is stored."""
+    """Put a stored lat-long picture around the scene."""
     scene.world = bpy.data.worlds.new("world")
     scene.world.use_nodes = True
     nodes, links = scene.world.node_tree.nodes, scene.world.node_tree.links

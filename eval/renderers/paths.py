@@ -1,4 +1,4 @@
-"""Meshes by Mitsuba's path tracer: the truth that others are held against."""
+"""Path-trace meshes by Mitsuba, the truth of comparisons."""
 
 from __future__ import annotations
 
@@ -12,7 +12,7 @@ from tron.shading.environments.environment import EnvironmentMap
 
 
 def scene_of(shapes: Sequence[mi.Mesh], light: EnvironmentMap | None = None) -> mi.Scene:
-    """Meshes with their materials, and a light around them, if any."""
+    """Return a Mitsuba scene of meshes with their materials, and a light around them, if any."""
     lamp = {} if light is None else {"light": light.to_mitsuba()}
     return mi.load_dict({"type": "scene", **lamp, **{f"shape{k}": shape for k, shape in enumerate(shapes)}})
 
@@ -20,7 +20,7 @@ def scene_of(shapes: Sequence[mi.Mesh], light: EnvironmentMap | None = None) -> 
 def path_traced(
     shapes: Sequence[mi.Mesh], light: EnvironmentMap, camera: Camera, depth: int, paths: int, seed: int
 ) -> np.ndarray:
-    """(H, W, 3) linear radiance of meshes by Mitsuba's paths of up to ``depth`` edges, ``paths`` a pixel."""
+    """Render linear radiance (H, W, 3) of meshes by paths of up to ``depth`` edges, ``paths`` per pixel."""
     sensor = mitsuba_sensor(camera, paths)
     sensor["sampler"]["type"] = "multijitter"
     integrator = mi.load_dict({"type": "path", "max_depth": depth, "rr_depth": depth})

@@ -1,1 +1,1 @@
-"""results.json and its pictures -> one HTML page: sentences in templates, figures from rows."""
+"""HTML pages of results.json and its pictures: templates have the sentences, rows the figures."""

@@ -1,4 +1,4 @@
-"""Figures, verdicts and intervals as text: in tables, in tiles, in sentences and on the terminal."""
+"""Text of figures, verdicts and intervals, for tables, tiles, sentences and the terminal."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ FEW = 8
 
 
 def with_interval(row: Row, signed: bool | None = None) -> str:
-    """A row's figure with its unit, and its interval over scenes behind it: ``34.10 dB [32.85, 35.20]``.
+    """Format a row's figure with its unit and its interval over scenes: ``34.10 dB [32.85, 35.20]``.
 
     Intervals over fewer than LEAST scenes stay in results.json. Gains have a sign, unless ``signed`` says
     otherwise.
@@ -33,7 +33,7 @@ def with_interval(row: Row, signed: bool | None = None) -> str:
 
 
 def left_out(row: Row) -> str:
-    """Range of a gain where one scene is left out, in words; nothing where it was not measured."""
+    """Describe the range of a gain with one scene left out; empty if not measured."""
     if row.without_one is None:
         return ""
     low, high = (format_value(end, row.unit, signed=True) for end in row.without_one)
@@ -41,7 +41,7 @@ def left_out(row: Row) -> str:
 
 
 def row_cell(row: Row | None, tone: Tone = "plain") -> Cell:
-    """A row's figure and interval as a cell, a dash if it was not measured.
+    """Return a row's figure and interval as a cell, a dash if not measured.
 
     A gain in dB is good or bad where its interval says so.
     """
@@ -54,7 +54,7 @@ def row_cell(row: Row | None, tone: Tone = "plain") -> Cell:
 
 
 def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Tone]:
-    """The finding on one target in words, with its tone: reached or missed, and by how much."""
+    """Return the verdict on a target in words, with its tone: reached or missed, and by how much."""
     if measured is None:
         return "not measured", "plain"
     margin = target.margin(measured)
@@ -65,12 +65,12 @@ def verdict(target: Target, measured: float | None, unit: str) -> tuple[str, Ton
 
 
 def bound(target: Target, unit: str) -> str:
-    """The bound itself: ``at least 3.00 dB``; without a unit, of what was not measured, ``at least 3``."""
+    """Format a bound: ``at least 3.00 dB``; without a unit, if nothing was measured, ``at least 3``."""
     return f"{target.bound} {format_value(target.value, unit) if unit else f'{target.value:g}'}"
 
 
 def interval_note(scenes: int, observed: str = "") -> str:
-    """A note on the brackets of means over so many scenes.
+    """Return a note on the brackets of means over so many scenes.
 
     ``observed`` names what else was averaged over, such as "60 frames".
     """

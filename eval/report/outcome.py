@@ -1,4 +1,4 @@
-"""What a benchmark hands over: rows, curves, and pictures, which become files beside results.json."""
+"""Result of a benchmark: rows, curves, and pictures, which become files beside results.json."""
 
 from __future__ import annotations
 
@@ -23,16 +23,16 @@ Points = list[tuple[float, float]]
 
 @dataclass
 class Outcome:
-    """Figures of a benchmark and what its page shows beside them.
+    """Figures of a benchmark, and pictures and curves of its page.
 
     Attributes:
-        folder: of results.json.
-        rows: the figures, in the order in which they are read.
-        pictures: written already, in the order of the page.
-        absent: figure that could not be measured -> why.
+        folder: folder of results.json.
+        rows: the figures, in reading order.
+        pictures: written pictures, in the order of the page.
+        absent: unmeasured figure -> reason.
         series: name of a chart -> label of a line -> its points.
-        reproduce: command lines that measure it again; where there are none, the one that was typed.
-        inputs: what was measured (hashes of data and weights); joins settings and environment in
+        reproduce: command lines that repeat the measurement; by default the typed one.
+        inputs: inputs of the measurement (hashes of data and weights); joins settings and environment in
             results.json.
     """
 
@@ -45,7 +45,7 @@ class Outcome:
     inputs: dict[str, Any] = field(default_factory=dict)
 
     def add(self, rows: Iterable[Row]) -> None:
-        """Keep rows, with a line on stderr for each."""
+        """Keep rows; write one line each to stderr."""
         for row in rows:
             log.info("%s: %.4g %s", row.metric, row.value, row.unit)
             self.rows.append(row)
@@ -61,7 +61,7 @@ class Outcome:
 
 
 def save_group(folder: Path, section: str, file: str, group: Pictures | Films) -> Group:
-    """Write pictures or films below ``folder/pictures``; what results.json says of them."""
+    """Write pictures or films below ``folder/pictures``; return their entry in results.json."""
     place = folder / "pictures" / file
     films = isinstance(group, Films)
     if films:
@@ -93,7 +93,7 @@ def save_group(folder: Path, section: str, file: str, group: Pictures | Films) -
 
 
 def load_group(folder: Path, group: Group) -> Pictures | Films | None:
-    """The pictures or films of a group; None where a file is not there (git holds rows alone).
+    """Load the pictures or films of a group; None if a file is missing (git has rows only).
 
     Raises:
         TronError: a picture is damaged.
@@ -121,7 +121,7 @@ def load_group(folder: Path, group: Group) -> Pictures | Films | None:
 
 
 def _strip(group: Pictures) -> np.ndarray:
-    """All pictures as one, black between them where they differ in size."""
+    """Join all pictures into one, with black padding if sizes differ."""
     images = [picture.image for picture in group.pictures]
     height, width = (max(image.shape[axis] for image in images) for axis in (0, 1))
     rows = -(-len(images) // group.columns)
@@ -133,10 +133,10 @@ def _strip(group: Pictures) -> np.ndarray:
 
 
 def training_curves(runs: Mapping[str, Path]) -> dict[str, dict[str, Points]]:
-    """``loss`` and ``psnr`` over seconds of training, a line for each column of each run's metrics.csv.
+    """Return curves of ``loss`` and ``psnr`` over training seconds, one per column of each run's metrics.csv.
 
-    The stages' clocks are put one behind the other. A value that is only repeated (a validation's, until
-    the next) stands once, where it is new.
+    Clocks of stages are concatenated. A repeated value (of a validation, until the next one) is kept once,
+    where it is new.
 
     Args:
         runs: label of a run -> metrics.csv of tron-train; files that do not exist are left out, and so are

@@ -1,1 +1,1 @@
-"""Measuring the tracer: scene, peers, timing in turns, errors, hard cases of guidance."""
+"""Benchmark of the tracer: scene, peers, speed, errors, hard cases of guidance."""

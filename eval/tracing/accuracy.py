@@ -1,8 +1,8 @@
-"""Errors of the tracer against the float64 reference, on random rays of the benchmark's own view.
+"""Errors of the tracer against the float64 reference, on random rays of the benchmark's view.
 
 A ray whose float64 value stands within ``MARGIN`` of a threshold (alpha cut, stop, median, sides) may fall on
 either side of it in float32, and two hits within ``GAP`` of one another in either order: both are left out.
-The share of such rays is a figure of its own, and so is the share of all rays that are off, for any reason.
+The share of such rays is a figure of its own, and so is the share of all deviating rays.
 """
 
 from __future__ import annotations
@@ -26,7 +26,7 @@ ERROR_GAIN = 4
 
 
 def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
-    """Largest error of the unnormalised sums and of depth (relative), over ``rays`` random pixels."""
+    """Return the largest error of unnormalised sums and of depth (relative) over ``rays`` random pixels."""
     view = camera(size)
     gbuffer = contenders.tracer.gbuffer(view)
     found = {name: values.reshape(size * size, -1) for name, values in gbuffer.numpy().items()}
@@ -58,7 +58,7 @@ def camera_errors(contenders: Contenders, size: int, rays: int, seed: int) -> li
 
 
 def shadow_errors(contenders: Contenders, size: int, rays: int, seed: int) -> list[Row]:
-    """Largest error of transmittance over ``rays`` random shadow rays, and of the restarting peer."""
+    """Return the largest transmittance error over ``rays`` random shadow rays, and the restarting peer's."""
     scene = contenders.scene
     gbuffer = contenders.tracer.gbuffer(camera(size))
     origin, direction = random_rays(gbuffer, scene.spacing, rays, seed)
@@ -84,7 +84,7 @@ def _relative(found: np.ndarray, truth: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def _excluded(kind: str, steady: np.ndarray, difference: np.ndarray) -> list[Row]:
-    """Share of all rays that stand at a threshold, and of those that fell on its other side, to be seen."""
+    """Return the share of rays near a threshold, and the share that fell on the other side of it."""
     shares = {"rays_at_a_threshold": ~steady, "rays_off": difference > OFF}
     return [
         Row(metric=f"{kind}.{name}", value=float(which.mean()), unit="fraction", n=len(steady))
@@ -93,7 +93,7 @@ def _excluded(kind: str, steady: np.ndarray, difference: np.ndarray) -> list[Row
 
 
 def compare_images(contenders: Contenders, size: int) -> Pictures:
-    """Our image, the peer's along the same rays with the same stop, and their difference."""
+    """Show our image, the peer's image with the same rays and stop, and their difference."""
     view, integrator = camera(size), peers.load_integrator(peers.OUR_STOP)
     ours = np.clip(contenders.tracer.gbuffer(view).numpy()["rgb"], 0, 1)
     peer = np.clip(peers.through_centres(contenders.primitives, integrator, view), 0, 1)

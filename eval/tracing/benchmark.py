@@ -1,4 +1,4 @@
-"""Benchmark `tracing`: the tracer's speed and exactness beside others', and guidance where it is hard."""
+"""Benchmark `tracing`: speed and accuracy of the tracer against others, and hard cases of guidance."""
 
 from __future__ import annotations
 
@@ -37,30 +37,30 @@ Case = tuple[PositiveInt, PositiveInt]
 
 
 class Tracing(Benchmark):
-    """Parts of the benchmark and their sizes; beside results.json, times.json keeps every round's seconds."""
+    """Settings: parts and sizes; times.json beside results.json has the seconds of every round."""
 
     name: ClassVar[str] = "tracing"
 
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
     seed: int = 0
     rounds: PositiveInt = Field(
-        default=5, description="of timing in turns; three of what takes over a second"
+        default=5, description="rounds of timing in turns; three rounds of anything over a second"
     )
-    parts: list[Part] = Field(description="what is measured", min_length=1)
-    surfels: list[PositiveInt] = Field(description="sizes of the scene", min_length=1)
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
+    surfels: list[PositiveInt] = Field(description="numbers of surfels of the scene", min_length=1)
     pixels: list[PositiveInt] = Field(description="widths of the image, multiples of 4", min_length=1)
-    shadow_rays: PositiveInt = Field(default=200_000, description="random shadow rays")
+    shadow_rays: PositiveInt = Field(default=200_000, description="number of random shadow rays")
     shadow_spp: PositiveInt = Field(default=64, description="rays per pixel of the traced irradiance pass")
     gradient: list[Case] = Field(description="(surfels, pixels) of the gradient steps")
     irradiance: Case = Field(description="(surfels, pixels) of the comparison with Mitsuba's direct")
-    error_rays: PositiveInt = Field(default=2000, description="rays held against float64")
+    error_rays: PositiveInt = Field(default=2000, description="number of rays compared with float64")
     bounce: list[Case] = Field(description="(surfels, pixels) of transport, bake and frames with bounces")
     blender_python: Path | None = Field(
-        default=None, description="a Python that has bpy, of an environment of its own; null: no Cycles"
+        default=None, description="Python with bpy, in an environment of its own; null: no Cycles"
     )
 
     def check(self) -> None:
-        """Refuse sizes that the tile order of the rays cannot take, and a Python without Blender."""
+        """Refuse sizes that do not fit the tile order of the rays, and a Python without Blender."""
         odd = [size for size in self.pixels if size % 4]
         if odd:
             raise TronError(f"images of {odd[0]} pixels", "benchmark.pixels", "give multiples of 4")
@@ -68,7 +68,7 @@ class Tracing(Benchmark):
             blender_version(self.blender_python)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each figure."""
+        """Measure part by part; write one line per figure to stderr."""
         self.check()
         activate(self.variant)
         outcome, timed, shape = Outcome(output_dir), list[Timed](), SHAPES[0]
@@ -116,7 +116,7 @@ class Tracing(Benchmark):
         return outcome
 
     def _measure_irradiance(self, outcome: Outcome) -> list[Timed]:
-        """Ratio under every light, the worst of them, and the seconds of the pass."""
+        """Measure the ratio under every light, the worst ratio, and the seconds of the pass."""
         count, size = self.irradiance
         contenders, found = Contenders.of(count, self.seed), []
         for light in LIGHTS:

@@ -1,9 +1,8 @@
-"""White furnaces: balls and bowls under even light of 1, where a material's brightness is its albedo.
+"""White furnace tests: balls and bowls under constant light of 1, where brightness is albedo.
 
-What is white sends out all that arrives, whichever way light is found: by Mitsuba's paths in a mesh, by
-``lit`` of surfels or of a mesh beside them, after bounces in a bowl, baked into harmonics. What is not is
-held against Cycles, where Blender is given. All read one glTF, whose balls stand so far apart that none
-lights another.
+White materials reflect all incoming light, by every way of computing it: Mitsuba's paths on a mesh, ``lit``
+of surfels or of a mesh beside them, bounces in a bowl, baked harmonics. Other materials are compared with
+Cycles, if Blender is given. All read one glTF; its balls are too far apart to light each other.
 """
 
 from __future__ import annotations
@@ -64,7 +63,7 @@ WAYS = ("truth", "preview", "final", "mesh", "bowl", "bake")
 
 
 class Material(NamedTuple):
-    """Of a ball: base color of all channels, metallic and roughness."""
+    """Material of a ball: base color of all channels, metallic and roughness."""
 
     base_color: float
     metallic: float
@@ -72,7 +71,7 @@ class Material(NamedTuple):
 
     @property
     def case(self) -> str:
-        """In metrics, in hundredths: 50_100_38."""
+        """Name in metrics, in hundredths: 50_100_38."""
         return "_".join(f"{100 * each:.0f}" for each in self)
 
 
@@ -84,7 +83,7 @@ class Furnace:
     """Balls, each at its :func:`place`.
 
     Attributes:
-        balls: the part of each.
+        balls: one part per ball.
         seed: root of all random numbers.
     """
 
@@ -93,11 +92,11 @@ class Furnace:
 
     @classmethod
     def read(cls, path: Path, seed: int) -> Furnace:
-        """From a file of :func:`write_balls`."""
+        """Read a file of :func:`write_balls`."""
         return cls(load_model(path, fitted=False), seed)
 
     def by_paths(self) -> list[float]:
-        """Mean brightness of each ball by Mitsuba's path tracer."""
+        """Return the mean brightness of each ball by Mitsuba's path tracer."""
         shapes = [textured(ball, f"ball{n}").shape for n, ball in enumerate(self.balls)]
         light = EnvironmentMap.constant(1.0)
 
@@ -108,23 +107,23 @@ class Furnace:
         return self._means(seen)
 
     def by_surfels(self, estimation: Estimation) -> list[float]:
-        """The same of ``lit`` of surfels on the balls."""
+        """Return the mean brightness of each ball by ``lit`` of surfels on it."""
         return self._lit(self._relighter(self.balls, estimation))
 
     def by_mesh(self) -> list[float]:
-        """The same of ``lit`` of the balls themselves, beside surfels that nobody sees."""
+        """Return the mean brightness of each ball by ``lit`` of its mesh, beside hidden surfels."""
         aside = np.eye(4)
         aside[:3, 3] = -APART, 0, 0
         unseen = [self.balls[0].moved(aside)]
         return self._lit(self._relighter(unseen, FINEST, [[ball] for ball in self.balls]))
 
     def by_bounces(self) -> list[float]:
-        """Means of bowls, whose light has bounced; of surfels."""
+        """Return the mean brightness of bowls of surfels, with bounced light."""
         bowls = [bowl(ball) for ball in self.balls]
         return self._lit(self._relighter(bowls, FINEST), FRAMES)
 
     def by_harmonics(self) -> list[float]:
-        """Means of the balls' light as :func:`tron.relighting.baking.baked` writes it for other viewers."""
+        """Return the mean brightness of the balls' harmonics by :func:`tron.relighting.baking.baked`."""
         light = self._relighter(self.balls, PREVIEW).under(EnvironmentMap.constant(1.0))
         tracer = SurfelTracer(baked(light, EXPOSURE, look="none"))
 
@@ -162,33 +161,33 @@ class Furnace:
 
 
 def place(number: int) -> tuple[float, float, float]:
-    """Centre of a ball, z up."""
+    """Return the centre of a ball, z up."""
     return APART * (number % ACROSS), APART * (number // ACROSS), 0.0
 
 
 def camera(number: int) -> Camera:
-    """Looks down at a ball, as into a bowl."""
+    """Return a camera that looks down at a ball or into a bowl."""
     centre = np.array(place(number))
     eye = centre + 5 * np.array([0, -np.sin(0.35), np.cos(0.35)])
     return Camera.look_at(eye, centre, up=(0, 1, 0), fov_deg=25, width=SIDE, height=SIDE)
 
 
 def disk_mean(image: np.ndarray) -> float:
-    """Mean over what a :func:`camera` sees of its ball, (H, W, 3), but for the silhouette and what is NaN."""
+    """Average a :func:`camera`'s picture (H, W, 3) over its ball, without the silhouette and NaN."""
     y, x = (np.mgrid[:SIDE, :SIDE] + 0.5) / SIDE * 2 - 1
     radius = np.tan(np.arcsin(1 / 5)) / np.tan(np.radians(25 / 2))
     return float(np.nanmean(image[np.hypot(x, y) < WHOLE * radius]))
 
 
 def bowl(ball: Part) -> Part:
-    """The bottom of a ball, its inside."""
+    """Return the bottom of a ball, seen from inside."""
     middle = (ball.vertices.min(0) + ball.vertices.max(0)) / 2
     low = (ball.vertices - middle)[ball.faces].mean(1)[:, 2] < -CAP
     return replace(ball, faces=ball.faces[low, ::-1], normals=-ball.normals)
 
 
 def write_balls(path: Path, materials: Sequence[Material]) -> None:
-    """A glTF of a unit ball of each material at its place; its factors are the materials' own."""
+    """Write a glTF of a unit ball per material at its place; its factors are the materials' values."""
     sphere = trimesh.creation.icosphere(subdivisions=4)
 
     def arrange(tree: dict[str, Any]) -> None:
@@ -215,11 +214,11 @@ def write_balls(path: Path, materials: Sequence[Material]) -> None:
 
 
 def measure_furnace(python: Path | None, rounds: int, seed: int, threads: int, outcome: Outcome) -> None:
-    """Figures of every material and way, of Cycles, and of the price.
+    """Measure every material by every way and by Cycles, and the cost.
 
     Args:
-        python: that has Blender; None: Cycles is not asked.
-        rounds: of timing.
+        python: Python with Blender; None: without Cycles.
+        rounds: rounds of timing.
         seed: root of all random numbers.
         threads: of Cycles.
         outcome: takes rows, and what could not be measured.
@@ -255,7 +254,7 @@ def measure_furnace(python: Path | None, rounds: int, seed: int, threads: int, o
 
 
 def furnace_rows(found: Mapping[str, Sequence[float]]) -> list[Row]:
-    """Rows of the brightness of :data:`MATERIALS` by each way, in their order; some have white ones alone."""
+    """Return rows of brightness by each way, for materials in the order of :data:`MATERIALS`."""
     rows = [
         Row(metric=f"furnace.{way}.{material.case}", value=value, unit="x", n=1)
         for way, values in found.items()
@@ -290,7 +289,7 @@ def furnace_rows(found: Mapping[str, Sequence[float]]) -> list[Row]:
 
 
 def price(rounds: int, side: int = 256, paths: int = 64) -> dict[str, Times]:
-    """Processor time of a path-traced picture of nine balls and a floor, with either material, in turns."""
+    """Return CPU times of a path-traced picture of nine balls and a floor, with either material, in turns."""
     scenes = {"metallicroughness": _nine(metallic_roughness), "principled": _nine(_principled)}
     view = Camera.look_at((4, -6, 4), (0, 0, 0.5), fov_deg=45, width=side, height=side)
     sensor = mi.load_dict(mitsuba_sensor(view, paths))

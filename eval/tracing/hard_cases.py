@@ -1,7 +1,7 @@
-"""Guidance where it is hard, beside Mitsuba's path tracer on meshes: thin shadows, sheets, low suns, metals.
+"""Hard cases of guidance against Mitsuba's path tracer: thin shadows, sheets, low suns, metals.
 
-Surfels stand on the same panels as the meshes, densely and with the true materials, so only the estimator is
-judged. Thin shadows are held against 1,024 rays through the same surfels.
+Dense surfels with true materials are on the same panels as the meshes, so only the estimator is judged. Thin
+shadows are compared with 1,024 rays through the same surfels.
 """
 
 from __future__ import annotations
@@ -39,7 +39,7 @@ Vector = tuple[float, float, float]
 
 
 def measure_hard_cases(rounds: int) -> Iterator[Row]:
-    """Render all of them and their truth, a few minutes: rows of every case, and of the worst."""
+    """Render all cases and their truth, in a few minutes; return rows of every case, and of the worst."""
     deep, half, lit_deep, lit_half = thin_shadows(bars())
     sheets, suns = {}, {}
     for height in HEIGHTS:
@@ -79,7 +79,7 @@ def measure_hard_cases(rounds: int) -> Iterator[Row]:
 
 
 def thin_shadows(case: Case) -> tuple[dict[int, float], ...]:
-    """Ratios in deep and half shadow: of irradiance to many rays', of ``lit`` to Mitsuba's paths."""
+    """Return ratios in deep and half shadow: irradiance over many rays', ``lit`` over Mitsuba's paths."""
     light = Relighter(case.scene(), Estimation(rays=REFERENCE, bounces=0), proxy="never").under(case.light)
     many = light.render(case.camera, 99)
     truth, solid = luminance(many.irradiance), many.mask > 0.99
@@ -100,14 +100,14 @@ def thin_shadows(case: Case) -> tuple[dict[int, float], ...]:
 
 
 def over_truth(case: Case, estimation: Estimation) -> np.ndarray:
-    """(3,) mean of ``lit`` over the path tracer's of as many bounces, where the pixels are solid."""
+    """Return the mean of ``lit`` over the path tracer's with equal bounces, on opaque pixels: (3,)."""
     found = Relighter(case.scene(), estimation, proxy="never").under(case.light).render(case.camera)
     solid = found.mask > 0.99
     return found.lit[solid].mean(0) / case.path_traced(PATHS, estimation.bounces + 2)[solid].mean(0)
 
 
 def metal_times(rounds: int, size: int = 256) -> dict[str, Times]:
-    """A preview of the metal box, and of the same surfels as if they were no metal, in turns."""
+    """Time previews of the metal box, and of the same surfels as dielectrics, in turns."""
     case = metal_box(sunny(50, 30, 4), size)
     scene = case.scene()
     dull = replace(scene, metallic=np.zeros_like(scene.metallic))
@@ -121,9 +121,9 @@ def metal_times(rounds: int, size: int = 256) -> dict[str, Times]:
 def sunny(
     elevation_deg: float, azimuth_deg: float, diameter_deg: float = 1.0, height: int = SUN_HEIGHT
 ) -> EnvironmentMap:
-    """A sun with a soft edge of a texel in an even sky, the ground below as bright as a tenth of it.
+    """Return a sun with an edge of one texel in a constant sky; the ground has a tenth of the sky's radiance.
 
-    Four fifths of an upward plane's light are the sun's.
+    The sun gives four fifths of the light on an upward plane.
     """
     polar = np.linspace(0, np.pi, height)[:, None]
     around = (np.arange(2 * height) + 0.5)[None] * np.pi / height
@@ -139,14 +139,14 @@ def sunny(
 
 
 def overcast(height: int = 64) -> EnvironmentMap:
-    """The overcast sky of the CIE (1955), three times as bright above as at the horizon; dark below."""
+    """Return the CIE overcast sky (1955): the zenith is three times the horizon; dark below."""
     up = np.cos(np.linspace(0, np.pi, height))[:, None, None]
     sky = np.where(up >= 0, (1 + 2 * np.maximum(up, 0)) / 3, 0.05) * np.ones((1, 2 * height, 3))
     return EnvironmentMap(np.float32(sky))
 
 
 def toward(elevation_deg: float, azimuth_deg: float) -> np.ndarray:
-    """(3,) unit direction to a point of the sky."""
+    """Return the unit direction to a point of the sky, (3,)."""
     e, a = np.radians([elevation_deg, azimuth_deg])
     return np.array([np.cos(e) * np.sin(a), np.cos(e) * np.cos(a), np.sin(e)])
 
@@ -174,7 +174,7 @@ class Panel:
     cell: float = 0.02
 
     def grid(self) -> tuple[np.ndarray, np.ndarray]:
-        """Centres (N, 3), and the standard deviations (2,) of all."""
+        """Return centres (N, 3), and the standard deviations (2,) of all surfels."""
         sides = [np.array(side) for side in (self.along, self.across)]
         places, sigmas = [], []
         for side in sides:
@@ -193,7 +193,7 @@ class Panel:
         return cross / np.linalg.norm(cross)
 
     def mesh(self, name: str) -> mi.Mesh:
-        """Two triangles of the material, which both sides have."""
+        """Return two triangles with the material on both sides."""
         base_color = {"type": "rgb", "value": list(self.base_color)}
         material = metallic_roughness(base_color, self.roughness, self.metallic)
         properties = mi.Properties()
@@ -208,7 +208,7 @@ class Panel:
 
 
 def box(centre: Vector, half: Vector, *, inwards: bool = False, **material: Any) -> list[Panel]:
-    """Six panels of a box, which face outwards or all ``inwards``."""
+    """Return six panels of a box, facing outwards or ``inwards``."""
     panels = []
     for axis in range(3):
         for side in (1.0, -1.0):
@@ -224,7 +224,7 @@ def box(centre: Vector, half: Vector, *, inwards: bool = False, **material: Any)
 
 
 def surfels(panels: list[Panel]) -> GaussianScene:
-    """All panels as one scene, by their true materials; its spacing is that of most of its surfels."""
+    """Return all panels as one scene with true materials; its spacing is the most frequent one."""
     grids = [panel.grid() for panel in panels]
     counts = [len(points) for points, _ in grids]
 
@@ -262,11 +262,11 @@ class Case:
     camera: Camera
 
     def scene(self) -> GaussianScene:
-        """The surfels."""
+        """Return the surfels."""
         return surfels(self.panels)
 
     def path_traced(self, spp: int, segments: int = 8) -> np.ndarray:
-        """(H, W, 3) radiance by Mitsuba's paths through the meshes, linear."""
+        """Render linear radiance (H, W, 3) of the meshes by Mitsuba's paths."""
         meshes = {f"panel{k}": panel.mesh(f"panel{k}") for k, panel in enumerate(self.panels)}
         scene = mi.load_dict({"type": "scene", "light": self.light.to_mitsuba(), **meshes})
         sensor = mi.load_dict({**mitsuba_sensor(self.camera, spp)})
@@ -275,7 +275,7 @@ class Case:
 
 
 def ground(half: float, cell: float, **material: Any) -> Panel:
-    """A square of the plane z = 0 that faces up."""
+    """Return a square of the plane z = 0 that faces up."""
     return Panel((-half, -half, 0), (2 * half, 0, 0), (0, 2 * half, 0), cell=cell, **material)
 
 
@@ -296,11 +296,11 @@ def bars() -> Case:
 def sheet(
     height: float, light: EnvironmentMap, offset: tuple[float, float] = (0.0, 0.0), size: int = 48
 ) -> Case:
-    """A sheet of side 1 that faces up above a floor; the view is straight down, from below it, at its shadow.
+    """A sheet of side 1 that faces up above a floor; the camera is below it and looks down at its shadow.
 
     Args:
-        height: of the sheet.
-        offset: of the shadow's middle, world.
+        height: height of the sheet.
+        offset: offset of the shadow's middle, world.
     """
     above = Panel((-0.5, -0.5, height), (1, 0, 0), (0, 1, 0), (0.6, 0.5, 0.4), 0.6, cell=0.04)
     made = [ground(2.0, 0.04, base_color=(0.5, 0.5, 0.5), roughness=0.6), above]

@@ -1,4 +1,4 @@
-"""Other renderers that the tracer is timed against, and one scene of surfels in the hands of all.
+"""Other renderers that the tracer is timed against, and one scene of surfels for all.
 
 Camera rays: Mitsuba's ``volprim_rf_basic`` on its ellipsoids, with the same surfels. The shipped integrator
 stops where transmittance falls below 0.01, which is written in its source. For equal work
@@ -58,19 +58,19 @@ MAX_RESTARTS = 512
 
 @dataclass
 class Contenders:
-    """The scene and everyone's form of it, each built when asked for; ``shape`` is one of SHAPES."""
+    """The scene in the form of each renderer, built on first use; ``shape`` is one of SHAPES."""
 
     scene: GaussianScene
     shape: str = SHAPES[0]
 
     @classmethod
     def of(cls, count: int, seed: int, shape: str = SHAPES[0]) -> Contenders:
-        """Contenders for ``count`` drawn surfels."""
+        """Return contenders for ``count`` drawn surfels."""
         return cls(surfels(count, seed), shape)
 
     @cached_property
     def tracer(self) -> SurfelTracer:
-        """TRON's tracer, its hierarchy built."""
+        """TRON's tracer with its hierarchy."""
         return SurfelTracer(self.scene)
 
     @cached_property
@@ -85,10 +85,10 @@ class Contenders:
 
 
 def camera_peers(contenders: Contenders, view: Camera) -> dict[str, Callable[[], Any]]:
-    """Name in metrics -> a call that renders one frame, of every peer that can run here.
+    """Return name in metrics -> a call that renders one frame, for every peer that can run here.
 
-    volprim renders one ray a pixel, somewhere in the pixel, as a user does; the closest hit goes through the
-    pixels' centres, tile after tile, without opacity, order or colour.
+    volprim renders one random ray per pixel, as a user would; the closest hit uses rays through pixel
+    centres, tile after tile, without opacity, order or colour.
     """
     scene, sensed, (origin, direction) = contenders.quads, sensor(view), tile_rays(view)
     ours, shipped = load_integrator(OUR_STOP), load_integrator()
@@ -103,10 +103,10 @@ def camera_peers(contenders: Contenders, view: Camera) -> dict[str, Callable[[],
 
 
 def load_integrator(stop: float = SHIPPED_STOP) -> Any:
-    """The shipped integrator, or its source with another transmittance that ends rays.
+    """Load the shipped integrator, or its source with another stopping transmittance.
 
     Raises:
-        TronError: this Mitsuba's source no longer holds the line to be replaced.
+        TronError: this Mitsuba's source does not have the line to replace.
     """
     from mitsuba.ad.integrators import volprim_rf_basic as shipped  # pyright: ignore[reportMissingImports]
 
@@ -135,7 +135,7 @@ def _import_beside(shipped: Any, source: str, name: str) -> None:
 
 
 def primitives(scene: GaussianScene, shape: str = SHAPES[0]) -> mi.Scene:
-    """The surfels as flat ellipsoids in a Mitsuba scene, harmonics of degree 0."""
+    """Return the surfels as flat ellipsoids in a Mitsuba scene, with harmonics of degree 0."""
     scales = scene.scales()
     flat = np.concatenate([scales, THINNESS * scales.min(1, keepdims=True)], 1)
     tensors = {
@@ -150,17 +150,17 @@ def primitives(scene: GaussianScene, shape: str = SHAPES[0]) -> mi.Scene:
 
 
 def sensor(camera: Camera) -> mi.Sensor:
-    """The camera with a box filter and one sample a pixel."""
+    """Return the camera with a box filter and one sample per pixel."""
     return mi.load_dict(mitsuba_sensor(camera, spp=1))
 
 
 def render(scene: mi.Scene, view: mi.Sensor, integrator: Any) -> mi.TensorXf:
-    """One frame as a user renders it: one ray a pixel, somewhere in the pixel."""
+    """Render one frame as a user would: one random ray per pixel."""
     return mi.render(scene, sensor=view, integrator=integrator, spp=1)
 
 
 def through_centres(scene: mi.Scene, integrator: Any, camera: Camera) -> np.ndarray:
-    """(H, W, 3) float32 radiance along the rays through the pixel centres: for comparing, not for timing."""
+    """Render radiance (H, W, 3) float32 along rays through pixel centres, for comparison, not for timing."""
     rays = np.ascontiguousarray(camera.rays().reshape(-1, 3).T, np.float32)
     origin = dr.repeat(mi.Point3f([float(x) for x in camera.position]), rays.shape[1])
     sampler = mi.load_dict({"type": "independent", "sample_count": 1})
@@ -172,7 +172,7 @@ def through_centres(scene: mi.Scene, integrator: Any, camera: Camera) -> np.ndar
 
 
 def quads(scene: GaussianScene) -> mi.Scene:
-    """Two triangles a surfel, 2 k and 2 k + 1 for surfel k, in a Mitsuba scene, its hierarchy built."""
+    """Return two triangles per surfel, 2 k and 2 k + 1 for surfel k, in a Mitsuba scene with hierarchy."""
     geometry = pack(SurfelParameters.from_scene(scene)).geometry
     # The twelfth float of a surfel's record is the squared radius that counts, in sigmas.
     reach = np.sqrt(np.maximum(np.array(geometry).reshape(len(scene), 4 * GEOMETRY_PACKETS)[:, 11], 0.0))
@@ -191,7 +191,7 @@ def quads(scene: GaussianScene) -> mi.Scene:
 
 
 def tile_rays(view: Camera) -> tuple[mi.Point3f, mi.Vector3f]:
-    """Rays through the pixel centres, a 4 x 4 tile after the other: the order that is best for a packet."""
+    """Return rays through pixel centres in the order of 4 x 4 tiles, the best order for packets."""
     tiles = view.rays().reshape(view.height // TILE, TILE, view.width // TILE, TILE, 3)
     rays = tiles.transpose(0, 2, 1, 3, 4).reshape(-1, 3)
     origin = dr.repeat(mi.Point3f([float(x) for x in view.position]), len(rays))
@@ -207,7 +207,7 @@ def closest_hit(
     active: mi.Bool | bool = True,
     coherent: bool = False,
 ) -> mi.Float:
-    """Distance of the nearest quad along each ray, infinite where there is none."""
+    """Return the distance of the nearest quad along each ray, infinite if there is none."""
     ray, flags = mi.Ray3f(origin, direction), (mi.Bool(coherent), mi.Bool(active))
     return scene.ray_intersect_preliminary(ray, *flags).t
 
@@ -220,10 +220,10 @@ def any_hit(
 
 
 class RestartedShadows:
-    """Transmittance by restarted closest-hit queries, under TRON's rules as far as restarts can follow them.
+    """Transmittance by restarted closest-hit queries, with TRON's rules as far as restarts allow.
 
-    Front faces count from the origin, back faces beyond two spacings, a ray ends below 0.01. Surfels that lie
-    within ``RESTART_OFFSET`` behind another hit are skipped: that is what restarting loses.
+    Front faces count from the origin, back faces beyond two spacings, a ray ends below 0.01. Restarts miss
+    surfels within ``RESTART_OFFSET`` behind another hit.
     """
 
     def __init__(self, scene: GaussianScene, traced: mi.Scene) -> None:
@@ -236,7 +236,7 @@ class RestartedShadows:
 
     @dr.syntax
     def transmittance(self, origin: mi.Point3f, direction: mi.Vector3f) -> mi.Float:
-        """Product of (1 - alpha) over what blocks each ray; exactly 0 below 0.01."""
+        """Return the product of (1 - alpha) over the surfels on each ray; exactly 0 below 0.01."""
         product, travelled, queries = mi.Float(1), mi.Float(0), mi.UInt32(0)
         going = mi.Bool(True)
         while going:
@@ -263,7 +263,7 @@ def gsplat_available() -> bool:
 
 
 def gsplat_frame(scene: GaussianScene, camera: Camera) -> Callable[[], Any]:
-    """A call that renders one frame with harmonics of degree 0 and waits for the device."""
+    """Return a call that renders one frame with harmonics of degree 0 and waits for the device."""
     import torch
     from gsplat import rasterization_2dgs  # pyright: ignore
 

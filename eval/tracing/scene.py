@@ -1,10 +1,9 @@
-"""The benchmark's scene as surfels and as a mesh of the same surfaces for Mitsuba, its view, its lights.
+"""The benchmark's scene: surfels, a mesh of the same surfaces for Mitsuba, camera and lights.
 
 A floor, three spheres, a torus and a box. Surfels stand evenly by area along Roberts' R2 sequence (2018, "The
-Unreasonable Effectiveness of Quasirandom Sequences"), a little off the surface and a little tilted, as a
-reconstruction leaves them; the floor, of which the camera sees much, gets half its share. Their scales are
-set so that the summed area of their three-sigma disks covers the surface OVERLAP times: some 33 candidates a
-ray.
+Unreasonable Effectiveness of Quasirandom Sequences"), slightly off the surface and slightly tilted, as in a
+reconstruction; the floor, which fills much of the view, has half its share. Scales are set so that the summed
+area of the three-sigma disks covers the surface OVERLAP times: some 33 candidates per ray.
 
 Every surface is a closed form on the unit square whose map preserves area, so even points stay even.
 """
@@ -44,14 +43,14 @@ class Surface(abc.ABC):
 
     @abc.abstractmethod
     def at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Points and outward unit normals, two (N, 3) float64 arrays, world."""
+        """Return points and outward unit normals, two (N, 3) float64 arrays, world."""
 
     @abc.abstractmethod
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Lattices (u, v), 1D each and ascending, whose quads cover the surface."""
+        """Return lattices (u, v), 1D each and ascending, whose quads cover the surface."""
 
     def mesh(self, fineness: int = 96) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Triangles of the surface: vertices (V, 3), vertex normals (V, 3), faces (F, 3) wound outwards."""
+        """Return triangles: vertices (V, 3), vertex normals (V, 3), faces (F, 3) wound outwards."""
         vertices, normals, faces = [], [], []
         offset = 0
         for u, v in self.patches(fineness):
@@ -118,7 +117,7 @@ class Sphere(Surface):
         return np.array(self.centre) + self.radius * normals, normals
 
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Even in the polar angle, so that the poles are as fine as the equator."""
+        """Return a lattice even in the polar angle, so that poles are as fine as the equator."""
         polar = np.linspace(0, np.pi, fineness // 2 + 1)
         return [(np.linspace(0, 1, fineness + 1), (1 - np.cos(polar)) / 2)]
 
@@ -137,7 +136,7 @@ class Torus(Surface):
         return 4 * np.pi**2 * self.major * self.minor
 
     def _share(self, angle: np.ndarray) -> np.ndarray:
-        """Share of the area below a tube angle: the integral of (R + r cos b) / (2 pi R)."""
+        """Return the share of the area below a tube angle: the integral of (R + r cos b) / (2 pi R)."""
         return (self.major * angle + self.minor * np.sin(angle)) / (2 * np.pi * self.major)
 
     def at(self, u: np.ndarray, v: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -149,7 +148,7 @@ class Torus(Surface):
         return np.array(self.centre) + self.major * outwards + self.minor * normals, normals
 
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:
-        """Even in the tube angle."""
+        """Return a lattice even in the tube angle."""
         return [(np.linspace(0, 1, fineness + 1), self._share(np.linspace(0, 2 * np.pi, fineness // 2 + 1)))]
 
 
@@ -177,7 +176,7 @@ class Box(Surface):
         return np.array(self.centre) + self.half * points, normals
 
     def patches(self, fineness: int) -> list[tuple[np.ndarray, np.ndarray]]:  # noqa: ARG002 (flat)
-        """One quad a face; the faces' upper ends stay a hair inside their strip of u."""
+        """Return one quad per face; upper ends of faces stay slightly inside their strip of u."""
         return [(np.array([k, k + 1 - 1e-9]) / 6, np.array([0.0, 1.0])) for k in range(6)]
 
 
@@ -192,12 +191,12 @@ SURFACES: tuple[Surface, ...] = (
 
 
 def camera(size: int) -> Camera:
-    """The view of ``size`` x ``size`` pixels; a few at the top miss the floor."""
+    """Return the camera of ``size`` x ``size`` pixels; a few at the top miss the floor."""
     return Camera.look_at((4.2, -3.6, 3.0), (0.0, 0.0, 0.35), fov_deg=27, width=size, height=size)
 
 
 def surfels(count: int, seed: int, lift: float = LIFT) -> GaussianScene:
-    """``count`` surfels of degree 2 over the surfaces, in random order; opacities are Beta(2.2, 0.6)."""
+    """Draw ``count`` surfels of degree 2 on the surfaces, in random order; opacities are Beta(2.2, 0.6)."""
     rng = seeds.generator(seed, "tracing", "surfels", count, 2)
     areas = np.array([s.area for s in SURFACES])
     shares = areas * np.where(np.arange(len(SURFACES)) == 0, FLOOR_SHARE, 1.0)
@@ -235,14 +234,14 @@ def surfels(count: int, seed: int, lift: float = LIFT) -> GaussianScene:
 
 
 def r2_sequence(count: int, shift: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """``count`` points of the R2 sequence, moved by ``shift`` (2,) on the torus: two (count,) arrays."""
+    """Return ``count`` points of the R2 sequence, shifted by ``shift`` (2,) modulo 1: two (count,) arrays."""
     steps = np.arange(1, count + 1)[:, None] / _PLASTIC ** np.array([1, 2])
     points = (steps + shift) % 1.0
     return points[:, 0], points[:, 1]
 
 
 def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
-    """(M, 3, 3) rotations whose third column is the normal, turned about it at random."""
+    """Return rotations (M, 3, 3) with the normal as third column, turned about it at random."""
     other = np.where(np.abs(normals[:, :1]) > 0.9, [[0.0, 1.0, 0.0]], [[1.0, 0.0, 0.0]])
     a = np.cross(other, normals)
     a /= np.linalg.norm(a, axis=1, keepdims=True)
@@ -253,9 +252,9 @@ def _frames(normals: np.ndarray, rng: np.random.Generator) -> np.ndarray:
 
 
 def mitsuba_mesh() -> dict[str, Any]:
-    """The same surfaces as white diffuse triangle meshes: shapes for ``mi.load_dict``.
+    """Return the surfaces as white diffuse triangle meshes: shapes for ``mi.load_dict``.
 
-    White, because then the radiance that leaves them is irradiance / pi, what TRON's pass computes.
+    The radiance of a white surface is irradiance / pi, which TRON's pass computes.
     """
     import mitsuba as mi
 
@@ -276,14 +275,14 @@ def mitsuba_mesh() -> dict[str, Any]:
 
 
 def _angles() -> tuple[np.ndarray, np.ndarray]:
-    """Elevation and azimuth of every texel, radians."""
+    """Return elevation and azimuth of every texel, radians."""
     elevation = np.pi / 2 - np.linspace(0, np.pi, MAP_HEIGHT)[:, None]
     azimuth = (np.arange(2 * MAP_HEIGHT) + 0.5)[None] / (2 * MAP_HEIGHT) * 2 * np.pi
     return elevation, azimuth
 
 
 def _spot(elevation_deg: float, azimuth_deg: float, radius_deg: float, soft_deg: float) -> np.ndarray:
-    """(H, W) in [0, 1]: a disk of the sphere with a linear edge."""
+    """Return a disk of the sphere with a linear edge, (H, W) in [0, 1]."""
     elevation, azimuth = _angles()
     e, a = np.radians(elevation_deg), np.radians(azimuth_deg)
     cosine = np.sin(elevation) * np.sin(e) + np.cos(elevation) * np.cos(e) * np.cos(azimuth - a)
@@ -299,7 +298,7 @@ def _sky(zenith: float, horizon: float, ground: float) -> np.ndarray:
 
 
 def sun() -> EnvironmentMap:
-    """A sun of two degrees' radius, 40 above the horizon; four fifths of an upward plane's light is its."""
+    """Return a sun of 2 degrees' radius, 40 degrees high; it gives four fifths of an upward plane's light."""
     sky = _sky(0.3, 0.5, 0.12)[..., None] * np.array([0.8, 0.9, 1.1])
     disk = _spot(40, 250, 2.0, 1.5)[..., None] * np.array([1.05, 1.0, 0.9])
     share = EnvironmentMap(disk).unoccluded_upward().mean() / EnvironmentMap(sky).unoccluded_upward().mean()
@@ -307,7 +306,7 @@ def sun() -> EnvironmentMap:
 
 
 def soft() -> EnvironmentMap:
-    """Two wide windows and a dim room: penumbras everywhere."""
+    """Return two wide windows in a dim room: penumbras everywhere."""
     room = _sky(0.25, 0.2, 0.1)[..., None] * np.ones(3)
     large = _spot(50, 220, 22, 10)[..., None] * np.array([1.0, 0.97, 0.9]) * 6
     small = _spot(25, 60, 14, 8)[..., None] * np.array([0.8, 0.9, 1.1]) * 4

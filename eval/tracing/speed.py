@@ -1,18 +1,17 @@
-"""What the tracer's work costs, each beside what a user would pick instead; and the rows of it.
+"""Time of each task of the tracer beside the user's alternative, and rows of the times.
 
 Camera rays: frames. Shadow rays come in two sets. Random ones leave the visible surface under
-cosine-distributed directions of their own: the worst case of every packet tracer. The others are those of the
-irradiance pass, in its order, by running the pass itself with something else in the way of the light; what is
-not tracing is timed with nothing in the way and taken off both sides.
+cosine-distributed directions of their own: the worst case of every packet tracer. The others are the rays of
+the irradiance pass, in its order: the pass runs with another occluder. The time without tracing is measured
+with no occluder, and subtracted from both sides.
 
 A gradient step renders, compares with a grey image by L2 and differentiates by every parameter of the
 surfels. TRON's packs the parameters, bins, traces and replays, and differentiates means, quaternions,
 log-scales, logits, harmonics and materials; the peer's, through ``mi.render`` and ``dr.backward``, its
-ellipsoids' centres, scales, quaternions, opacities and harmonics. The peer's hierarchy stands still: that it
-would have to be built anew after a step is not counted.
+ellipsoids' centres, scales, quaternions, opacities and harmonics. The peer's hierarchy is fixed: rebuilding
+it after a step is not counted.
 
-Light that bounces: transport is traced once a scene, a light is baked once, and a frame composites what was
-baked.
+Bounced light: transport is traced once per scene, a light is baked once, and a frame composites the bake.
 """
 
 from __future__ import annotations
@@ -58,12 +57,12 @@ Found = tuple[Timed, list[Row]]
 
 
 def case_of(contenders: Contenders, size: int) -> str:
-    """Name in metrics, such as 50k_512."""
+    """Return the name in metrics, such as 50k_512."""
     return f"{format_count(len(contenders.scene))}_{size}"
 
 
 def measure_shapes(contenders: Contenders, size: int, rounds: int) -> str:
-    """The faster of the plugins for ``volprim_rf_basic``'s primitives."""
+    """Time the plugins for ``volprim_rf_basic``'s primitives and choose the faster."""
     sensor, integrator = peers.sensor(camera(size)), peers.load_integrator(peers.OUR_STOP)
     scenes = {shape: peers.primitives(contenders.scene, shape) for shape in peers.SHAPES}
     frames = {shape: lambda s=scene: peers.render(s, sensor, integrator) for shape, scene in scenes.items()}
@@ -72,7 +71,7 @@ def measure_shapes(contenders: Contenders, size: int, rounds: int) -> str:
 
 
 def measure_camera(contenders: Contenders, size: int, rounds: int) -> Found:
-    """A frame: ratios to the peers, million rays a second of all, and the time of binning within TRON's."""
+    """Time a frame: ratios to the peers, million rays per second of all, and TRON's time of binning."""
     view, tracer = camera(size), contenders.tracer
     others = peers.camera_peers(contenders, view)
     contestants: dict[str, Callable[[], Any]] = {
@@ -93,22 +92,22 @@ def measure_camera(contenders: Contenders, size: int, rounds: int) -> Found:
 
 @dataclass
 class Occluder:
-    """Tracer as the irradiance pass sees it; ``transmittance`` traces one ray a lane."""
+    """Stand-in for the tracer in the irradiance pass; ``transmittance`` traces one ray per lane."""
 
     scene: GaussianScene
     transmittance: Callable[[mi.Point3f, mi.Vector3f, mi.Bool], mi.Float]
 
     def transmittances(self, fans: Fans) -> list[mi.Float]:
-        """One transmittance for each direction."""
+        """Return one transmittance per direction."""
         return [
             self.transmittance(fans.origin, d, a) for d, a in zip(fans.directions, fans.active, strict=True)
         ]
 
 
 def occluders(contenders: Contenders) -> dict[str, Occluder]:
-    """Occluders of the pass: nothing, or quads, opaque or not.
+    """Return occluders of the pass: nothing, or quads, opaque or not.
 
-    Nothing still looks at the ray, so that no one optimises it away.
+    The occluder ``nothing`` still reads the ray, so that the compiler does not remove it.
     """
     quads = contenders.quads
 
@@ -127,7 +126,7 @@ def occluders(contenders: Contenders) -> dict[str, Occluder]:
 
 
 def count_rays(scene: GaussianScene, gbuffer: GBuffer, light: EnvironmentLight, spp: int, seed: int) -> int:
-    """Number of the rays that the irradiance pass asks for."""
+    """Count the rays of the irradiance pass."""
     total = dr.zeros(mi.UInt32, 1)
 
     def counted(_origin: mi.Point3f, _direction: mi.Vector3f, active: mi.Bool) -> mi.Float:
@@ -139,7 +138,7 @@ def count_rays(scene: GaussianScene, gbuffer: GBuffer, light: EnvironmentLight, 
 
 
 def measure_shadow(contenders: Contenders, size: int, rays: int, spp: int, seed: int, rounds: int) -> Found:
-    """Both sets of rays, and the builds; ``rays`` random ones, ``spp`` a pixel of the pass."""
+    """Time both sets of rays, and the builds; ``rays`` random rays, ``spp`` per pixel of the pass."""
     scene, tracer, quads = contenders.scene, contenders.tracer, contenders.quads
     gbuffer, light = tracer.gbuffer(camera(size)), EnvironmentLight(soft())
     ray = random_rays(gbuffer, scene.spacing, rays, seed)
@@ -166,10 +165,10 @@ def measure_shadow(contenders: Contenders, size: int, rays: int, spp: int, seed:
 
 
 def shadow_rows(timed: Timed, rays: int, pass_rays: int) -> Iterator[Row]:
-    """Rays a second and ratios, of random rays and of the pass's, then builds.
+    """Yield rows of rays per second and ratios, for random rays and for the pass, then builds.
 
-    TRON's build is in the ratios; the peers' builds are not. What the pass costs with nothing in the way is
-    taken off both sides.
+    TRON's build is in the ratios; the peers' builds are not. The time of the pass with no occluder is
+    subtracted from both sides.
     """
     median = {name: times.median for name, times in timed.times.items()}
     for kind, count in (("random", rays), ("irradiance", pass_rays)):
@@ -189,10 +188,10 @@ def shadow_rows(timed: Timed, rays: int, pass_rays: int) -> Iterator[Row]:
 
 
 def random_rays(gbuffer: GBuffer, spacing: float, rays: int, seed: int) -> tuple[mi.Point3f, mi.Vector3f]:
-    """Rays from ``rays`` random visible points into cosine-distributed directions, in the pixels' order.
+    """Return rays from ``rays`` random visible points in cosine-distributed directions, in pixel order.
 
-    Only points of at least half opacity are drawn from; origins stand off the surface as the irradiance
-    pass's do.
+    Only points of at least half opacity are drawn; origins are offset from the surface as in the irradiance
+    pass.
     """
     rng = seeds.generator(seed, "tracing", "shadow rays", rays)
     buffers = gbuffer.numpy()
@@ -211,7 +210,7 @@ def random_rays(gbuffer: GBuffer, spacing: float, rays: int, seed: int) -> tuple
 
 
 def measure_gradient(contenders: Contenders, size: int, rounds: int) -> Found:
-    """Both steps in turns, the peer stopping where TRON does, and the cosine of the harmonics' gradients."""
+    """Time both steps in turns with equal stops, and return the cosine of the harmonics' gradients."""
     ours, peer = surfel_step(contenders, size), volprim_step(contenders, size)
     timed = Timed("gradient", case_of(contenders, size), interleaved({"tron": ours, "volprim": peer}, rounds))
     by_color = np.array(ours()["sh"]).reshape(len(contenders.scene), -1, 3)[:, 0].ravel()
@@ -226,7 +225,7 @@ def measure_gradient(contenders: Contenders, size: int, rounds: int) -> Found:
 
 
 def surfel_step(contenders: Contenders, size: int) -> Callable[[], dict[str, Any]]:
-    """A call that makes TRON's step from scratch: parameter -> gradient, evaluated by the caller."""
+    """Return a call that makes TRON's step from scratch: parameter -> gradient, evaluated by the caller."""
     view = camera(size)
     parameters = SurfelParameters.from_scene(contenders.scene)
 
@@ -244,7 +243,7 @@ def surfel_step(contenders: Contenders, size: int) -> Callable[[], dict[str, Any
 
 
 def volprim_step(contenders: Contenders, size: int) -> Callable[[], dict[str, Any]]:
-    """A call that makes the peer's step: parameter -> gradient, evaluated by the caller."""
+    """Return a call that makes the peer's step: parameter -> gradient, evaluated by the caller."""
     scene = contenders.primitives
     integrator, sensor = peers.load_integrator(peers.OUR_STOP), peers.sensor(camera(size))
     parameters = mi.traverse(scene)
@@ -269,7 +268,7 @@ def volprim_step(contenders: Contenders, size: int) -> Callable[[], dict[str, An
 def measure_direct(
     contenders: Contenders, size: int, light: str, seed: int, rounds: int
 ) -> tuple[Timed, float, dict[str, np.ndarray], float]:
-    """The irradiance pass on surfels beside Mitsuba's ``direct`` on the mesh: as many rays, the same light.
+    """Time the irradiance pass on surfels and Mitsuba's ``direct`` on the mesh: equal rays, equal light.
 
     Mitsuba's 64 rays are tried in both ways it offers: all from one camera ray, and two from each of 32.
 
@@ -311,9 +310,9 @@ def measure_direct(
 
 
 def measure_bounce(contenders: Contenders, size: int, rounds: int) -> Found:
-    """Transport, bake, and a frame of 64 rays a pixel with and without what was baked, in turns.
+    """Time transport, bake, and a frame of 64 rays per pixel with and without the bake, in turns.
 
-    The frame with it is rendered by the ``Relighter``, and by hand from what that has traced and baked.
+    The frame with the bake is rendered by the ``Relighter``, and by hand from its transport and bake.
     """
     view, lighting = camera(size), Lighting(soft())
     untraced = Relighter(contenders.scene, proxy="never")

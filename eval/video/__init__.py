@@ -1,1 +1,1 @@
-"""Benchmark `video`: steadiness of films by exact flow, and the five scores of VBench."""
+"""Benchmark `video`: temporal stability by exact flow, and five scores of VBench."""

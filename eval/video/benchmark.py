@@ -1,4 +1,4 @@
-"""Benchmark `video`: how steady clips are, beside the truth's own steadiness, and VBench's scores of them."""
+"""Benchmark `video`: temporal stability of clips beside the truth's own, and VBench's scores."""
 
 from __future__ import annotations
 
@@ -41,23 +41,19 @@ class Clip:
 
 
 class Video(Benchmark):
-    """Methods' clips of a suite, and whether the measures order clips as they should."""
+    """Settings: methods' clips of a suite; a drawn clip checks the measures themselves."""
 
     name: ClassVar[str] = "video"
 
-    suite: Path | None = Field(description="folder of tron-eval export=SUITE; null: the drawn clip alone")
+    suite: Path | None = Field(description="folder of tron-eval export=SUITE; null: only the drawn clip")
     methods: Path | list[Path] | None = Field(description="folder of methods' folders, or [a,b]")
-    vbench: Path | None = Field(description="Python in whose environment `vbench` is; null: no VBench scores")
-    vbench_weights: Path = Field(
-        description="its VBENCH_CACHE_DIR; weights that lack are named, not downloaded"
-    )
-    vbench_timeout: PositiveFloat = Field(
-        description="seconds that VBench may take for all clips of a method"
-    )
-    seed: int = Field(default=0, description="of the drawn clip's noise, and of intervals")
+    vbench: Path | None = Field(description="Python of an environment with `vbench`; null: no VBench scores")
+    vbench_weights: Path = Field(description="VBENCH_CACHE_DIR; missing weights are named, not downloaded")
+    vbench_timeout: PositiveFloat = Field(description="time limit of VBench per method, seconds")
+    seed: int = Field(default=0, description="seed of the drawn clip's noise, and of the intervals")
 
     def check(self) -> None:
-        """Look whether suite and methods are given together."""
+        """Check that suite and methods are given together."""
         if (self.suite is None) != (self.methods is None):
             lacking = "suite" if self.suite is None else "methods"
             raise TronError(f"{lacking} is not given", mend="suite=DIR and methods=DIR belong together")
@@ -65,7 +61,7 @@ class Video(Benchmark):
             self._read(self.suite, self.methods)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure; one line on stderr for each figure.
+        """Measure; write one line per figure to stderr.
 
         Raises:
             TronError: a folder is not what it should be.
@@ -96,7 +92,7 @@ class Video(Benchmark):
         return VBench(self.vbench or Path(), self.vbench_weights.expanduser(), self.vbench_timeout)
 
     def _dimensions(self, outcome: Outcome) -> list[str]:
-        """VBench's dimensions that can be measured; why the others cannot."""
+        """Return VBench's measurable dimensions, and reasons why the others are not."""
         why = "no benchmark.vbench=PYTHON was given"
         absent = dict.fromkeys(WEIGHTS, why) if self.vbench is None else self._vbench().absent()
         for dimension, reason in absent.items():
@@ -111,7 +107,7 @@ def _measure(
     dimensions: Sequence[str],
     outcome: Outcome,
 ) -> dict[str, list[Clip]]:
-    """Clips of every method whose pictures are all there, a scene's surfaces in memory at a time."""
+    """Measure clips of every method with all pictures; one scene's surfaces are in memory at a time."""
     from eval.compare.displayed import displayed
     from eval.protocol.pictures import Fault
 
@@ -143,7 +139,7 @@ def _measure(
 
 
 def surfaces_of(scene: SuiteScene) -> Surfaces:
-    """Steps of a scene's test cameras over its foreground, by its true depth, which must be known."""
+    """Return steps of a scene's test cameras over its foreground, by its true depth, which must be known."""
     from eval.compare.scores import foreground
 
     depth = scene.depth()
@@ -154,7 +150,7 @@ def surfaces_of(scene: SuiteScene) -> Surfaces:
 def steadiness_rows(
     method: str, clips: Sequence[Clip], truth: Sequence[Clip] | None, seed: int
 ) -> Iterator[Row]:
-    """Roots of mean squares over all clips, and their mean squares over the truth's, with intervals."""
+    """Yield RMS figures over all clips, and mean squares over the truth's mean squares, with intervals."""
     for measure in MEASURES:
         of_method: list[Difference] = [getattr(each.steadiness, measure) for each in clips]
         n = sum(each.pixels for each in of_method)
@@ -169,7 +165,7 @@ def steadiness_rows(
 
 
 def vbench_rows(method: str, scores: Mapping[str, Mapping[str, float]], seed: int) -> Iterator[Row]:
-    """Means over clips, named SCENE.LIGHT, with intervals over scenes."""
+    """Yield means over clips, named SCENE.LIGHT, with intervals over scenes."""
     for dimension, by_clip in scores.items():
         found = [(name.partition(".")[0], value) for name, value in by_clip.items()]
         yield mean_row(f"vbench.{dimension}.{method}", "fraction", found, seed)

@@ -1,7 +1,7 @@
-"""Whether the measures order clips as they should: a clip of closed formulas, and three ways to spoil it.
+"""Check that the measures rank clips correctly: an analytic clip, and three spoiled versions of it.
 
 A textured floor, a wall and a ball before it, lit by a lamp, with a highlight on the ball that moves with the
-view; depth and colour are exact. The good clip is its truth with the noise of a renderer.
+view; depth and colour are exact. The good clip is the truth with a renderer's noise.
 """
 
 from __future__ import annotations
@@ -40,7 +40,7 @@ LOWER = (  # measure, the better clip, the worse one
 
 
 def made_clip() -> tuple[list[Camera], np.ndarray, np.ndarray]:
-    """Cameras, depth (K, H, W) along the rays, and display colours (K, H, W, 3)."""
+    """Return cameras, depth (K, H, W) along the rays, and display colours (K, H, W, 3)."""
     places = np.linspace(-0.9, 0.9, FRAMES)
     cameras = [
         Camera.look_at((x, -4.0, 1.6), (0.0, 0.0, 0.6), fov_deg=40, width=SIZE, height=SIZE) for x in places
@@ -50,7 +50,7 @@ def made_clip() -> tuple[list[Camera], np.ndarray, np.ndarray]:
 
 
 def spoiled(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
-    """The good clip; every other frame brighter; its first frame for all; its frames in random order."""
+    """Return the clip: good; every other frame brighter; first frame repeated; frames in random order."""
     random = generator(seed, "video", "order")
     good = np.clip(truth + NOISE * random.standard_normal(truth.shape), 0, 1)
     flash = 1 + FLASH * (-1.0) ** np.arange(len(truth))
@@ -66,7 +66,7 @@ def spoiled(truth: np.ndarray, seed: int) -> dict[str, np.ndarray]:
 
 
 def order_rows(seed: int) -> Iterator[Row]:
-    """The three measures of the four clips, their plain frame differences, and ``video.order_correct``."""
+    """Yield rows of three measures of four clips, plain frame differences, and ``video.order_correct``."""
     cameras, depth, truth = made_clip()
     surfaces = Surfaces.of(surface_motion(cameras, depth.__getitem__), depth > 0)
     clips = spoiled(truth, seed)
@@ -94,7 +94,7 @@ def ordered(measured: Mapping[str, Steadiness]) -> bool:
 
 
 def _drawn(camera: Camera) -> tuple[np.ndarray, np.ndarray]:
-    """Distance (H, W) along the rays and colours (H, W, 3) of one view."""
+    """Return distance (H, W) along the rays and colours (H, W, 3) of one view."""
     origin, rays = camera.position, camera.exact_rays()
     centre, radius, lamp = np.array([0.1, 0.0, 0.6]), 0.6, np.array([-2.0, -3.0, 4.0])
     with np.errstate(divide="ignore"):

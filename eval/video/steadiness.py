@@ -1,8 +1,8 @@
-"""Steadiness of a clip whose cameras and true depth are known: warping error, flicker, views far apart.
+"""Temporal stability of a clip with known cameras and true depth: warping error, flicker, distant views.
 
-All three compare what pictures show of one surface point, found by exact flow (:mod:`tron.flow`). None is
-zero for the truth: reflections move otherwise than the surface that shows them, lights that turn move
-shadows, path tracing is noisy, and interpolation blurs. They are read beside the truth's own.
+All three compare pictures of one surface point, found by exact flow (:mod:`tron.flow`). None is zero for the
+truth: reflections do not move with their surface, turning lights move shadows, path tracing is noisy, and
+interpolation blurs. Read them beside the truth's own figures.
 
 Frame differences without flow (VBench's temporal flickering) call a frozen picture perfect; these do not.
 """
@@ -19,13 +19,13 @@ from tron.flow import Match, warp
 
 
 class Step(NamedTuple):
-    """From one frame of a clip to another.
+    """Step from one frame of a clip to another.
 
     Attributes:
-        frame: number of the frame whose pixels are asked for.
-        other: of the frame that their surfaces are looked for in.
-        displacement: (H, W, 2) pixels, x then y, from each pixel to its surface's place there.
-        judged: (H, W) bool, pixels to judge whose surface both frames see.
+        frame: number of the first frame.
+        other: number of the other frame.
+        displacement: (H, W, 2) pixels, x then y, from each pixel to its surface's place in the other frame.
+        judged: (H, W) bool, pixels to judge, with surfaces that both frames see.
     """
 
     frame: int
@@ -42,13 +42,13 @@ class Difference(NamedTuple):
 
     @property
     def mean(self) -> float:
-        """Mean square, 0 where no pixel was judged."""
+        """Mean square, 0 if no pixel was judged."""
         return self.squared / self.pixels if self.pixels else 0.0
 
 
 @dataclass(frozen=True)
 class Surfaces:
-    """The steps of a clip: to the frame before, to that after, and to one half a clip away."""
+    """Steps of a clip: to the previous frame, to the next frame, and to the frame half a clip away."""
 
     before: Sequence[Step]
     after: Sequence[Step]
@@ -56,7 +56,7 @@ class Surfaces:
 
     @classmethod
     def of(cls, match: Callable[[int, int], Match], inside: np.ndarray) -> Surfaces:
-        """Steps of a clip of K frames, ``match`` as :func:`tron.flow.surface_motion` gives it.
+        """Compute the steps of a clip of K frames; ``match`` is from :func:`tron.flow.surface_motion`.
 
         Args:
             match: surfaces of one frame in another.
@@ -74,7 +74,7 @@ class Surfaces:
 def steps(
     match: Callable[[int, int], Match], inside: np.ndarray, pairs: Iterable[tuple[int, int]]
 ) -> list[Step]:
-    """The steps from frame to other frame of ``pairs``; arguments as of :meth:`Surfaces.of`."""
+    """Return a step for each (frame, other frame) of ``pairs``; arguments as in :meth:`Surfaces.of`."""
     found = []
     for frame, other in pairs:
         displacement, seen = match(frame, other)
@@ -83,11 +83,11 @@ def steps(
 
 
 def warping_error(frames: np.ndarray, moves: Iterable[Step]) -> Difference:
-    """Differences of each step's frame and the other, warped to it.
+    """Return differences between each step's frame and the other frame warped to it.
 
     Lai et al. 2018, *Learning Blind Video Temporal Consistency*, eq. 10, with the flow of the true surfaces.
-    Of :attr:`Surfaces.before` it is the warping error; of :attr:`Surfaces.far` it tells whether views far
-    apart show one scene.
+    For :attr:`Surfaces.before` it is the warping error; for :attr:`Surfaces.far` it shows whether distant
+    views show one scene.
 
     Args:
         frames: (K, H, W, 3) display values.
@@ -99,10 +99,10 @@ def warping_error(frames: np.ndarray, moves: Iterable[Step]) -> Difference:
 
 
 def flicker(frames: np.ndarray, surfaces: Surfaces) -> Difference:
-    """What each frame differs by from the mean of its two neighbours, warped to it.
+    """Return the difference of each frame from the mean of its two neighbours, warped to it.
 
-    The second difference along the surfaces: what changes evenly, as under a light that turns, cancels, and
-    what comes and goes within a frame is left. White noise of variance s^2 gives 1.5 s^2.
+    It is the second difference along the surfaces: even changes, as under a turning light, cancel; changes of
+    a single frame remain. White noise of variance s^2 gives 1.5 s^2.
 
     Args:
         frames: (K, H, W, 3) display values.
@@ -119,7 +119,7 @@ def flicker(frames: np.ndarray, surfaces: Surfaces) -> Difference:
 
 @dataclass(frozen=True)
 class Steadiness:
-    """One clip by one method; roots of means are in display values."""
+    """Figures of one clip by one method; RMS figures are in display values."""
 
     warping: Difference
     flicker: Difference
@@ -136,7 +136,7 @@ class Steadiness:
 
 
 def _summed(found: Iterable[tuple[np.ndarray, np.ndarray]]) -> Difference:
-    """Sum of differences (H, W, 3) over pixels (H, W) that are judged and were interpolated."""
+    """Sum differences (H, W, 3) over judged and interpolated pixels (H, W)."""
     squared, pixels = 0.0, 0
     for difference, judged in found:
         kept = judged & np.isfinite(difference).all(-1)

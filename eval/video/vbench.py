@@ -1,4 +1,4 @@
-"""VBench's five scores that need no prompt, by the real package, in a Python of its own.
+"""VBench's five prompt-free scores by the original package, in a Python of its own.
 
 VBench (Huang et al. 2024, `vbench` on PyPI) wants other versions of NumPy and transformers than TRON, so it
 runs out of process, in the Python that ``benchmark.vbench`` names. It downloads weights that are not there;
@@ -50,12 +50,12 @@ FRAMES, FPS = 100, 24.0
 
 @dataclass(frozen=True)
 class VBench:
-    """Where VBench is.
+    """Paths and time limit of VBench.
 
     Attributes:
         python: interpreter of an environment with ``vbench``.
-        weights: its VBENCH_CACHE_DIR.
-        timeout: seconds that all dimensions may take.
+        weights: VBENCH_CACHE_DIR.
+        timeout: time limit of all dimensions, seconds.
     """
 
     python: Path
@@ -63,7 +63,7 @@ class VBench:
     timeout: float
 
     def absent(self) -> dict[str, str]:
-        """Dimension -> why it cannot be measured."""
+        """Return dimension -> reason why it cannot be measured."""
         if why := self._no_package():
             return dict.fromkeys(WEIGHTS, why)
         missing = {
@@ -81,7 +81,7 @@ class VBench:
         return "" if done.returncode == 0 else f"{self.python} has no vbench: {_last_line(done.stderr)}"
 
     def measure(self, folder: Path, dimensions: Sequence[str]) -> dict[str, dict[str, float]]:
-        """Dimension -> name of a clip -> its score in [0, 1], of all .mp4 of a folder.
+        """Score all .mp4 of a folder; return dimension -> name of a clip -> score in [0, 1].
 
         Raises:
             TronError: it failed, took too long, or left out a clip.
@@ -108,7 +108,7 @@ class VBench:
 
 
 def write_clip(path: Path, frames: Sequence[np.ndarray] | np.ndarray) -> None:
-    """The first FRAMES pictures (H, W, 3) of a clip as a film of the paper's size, bicubic."""
+    """Write the first FRAMES pictures (H, W, 3) of a clip as a film of the paper's size, bicubic."""
     with VideoWriter(path, FPS, SIZE) as film:
         for frame in frames[:FRAMES]:
             enlarged = cv2.resize(np.asarray(frame, np.float32), SIZE, interpolation=cv2.INTER_CUBIC)
@@ -116,7 +116,7 @@ def write_clip(path: Path, frames: Sequence[np.ndarray] | np.ndarray) -> None:
 
 
 def _read(path: Path, dimensions: Sequence[str], clips: Sequence[Path]) -> dict[str, dict[str, float]]:
-    """``{dimension: [mean, [{"video_path", "video_results"}]]}``, as VBench writes it."""
+    """Read VBench's ``{dimension: [mean, [{"video_path", "video_results"}]]}``."""
     try:
         content = json.loads(path.read_bytes())
         found = {

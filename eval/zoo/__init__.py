@@ -1,1 +1,1 @@
-"""The zoo: what is lit of every kind of material, shape and light, drawn by a seed, beside path tracing."""
+"""The zoo: random materials, shapes and lights of every kind, lit and compared with path tracing."""

@@ -1,4 +1,4 @@
-"""Benchmark `zoo`: `lit` beside path tracing, on every kind of material, shape and light."""
+"""Benchmark `zoo`: `lit` against path tracing on every kind of material, shape and light."""
 
 from __future__ import annotations
 
@@ -20,21 +20,23 @@ Kind = Literal["ball", "bowl", "box", "steps", "sheet", "leaf", "wire", "crate",
 
 
 class Zoo(Benchmark):
-    """What is in the zoo; its seed draws shapes, materials and lights anew."""
+    """Settings of the zoo; the seed draws shapes, materials and lights."""
 
     name: ClassVar[str] = "zoo"
 
-    parts: list[Part] = Field(description="what is measured", min_length=1)
-    seed: int = Field(default=0, description="judged; any other is for development")
+    parts: list[Part] = Field(description="parts to measure", min_length=1)
+    seed: int = Field(default=0, description="seed; targets are for 0, other seeds are for development")
     variant: str = Field(default="llvm_ad_rgb", description="Mitsuba variant; cuda_ad_rgb on a GPU")
-    threads: PositiveInt | None = Field(default=None, description="of Dr.Jit and of Cycles; null: one a core")
+    threads: PositiveInt | None = Field(
+        default=None, description="Cycles and Dr.Jit threads; null: one a core"
+    )
     shapes: list[Kind] = Field(description="kinds of shapes", min_length=1)
     lights: list[str] | None = Field(default=None, description="names of lights; null: all")
-    materials: PositiveInt | None = Field(default=None, description="most of a shape's; null: all")
-    real_data: Path | None = Field(description="folder with hdri; without it maps are drawn")
-    denoisers: bool = Field(default=True, description="denoisers and the shipped network too")
+    materials: PositiveInt | None = Field(default=None, description="most materials per shape; null: all")
+    real_data: Path | None = Field(default=None, description="folder with hdri; without it maps are drawn")
+    denoisers: bool = Field(default=True, description="measure denoisers and the shipped network too")
     blender_python: Path | None = Field(
-        default=None, description="a Python that has bpy, of an environment of its own; null: no Cycles"
+        default=None, description="Python with bpy, in an environment of its own; null: no Cycles"
     )
 
     def check(self) -> None:
@@ -43,10 +45,10 @@ class Zoo(Benchmark):
             blender_version(self.blender_python)
 
     def run(self, output_dir: Path) -> Outcome:
-        """Measure part after part; one line on stderr for each shape and figure.
+        """Measure part by part; write one line per shape and figure to stderr.
 
         Raises:
-            TronError: a light is not there, or Blender failed.
+            TronError: a light does not exist, or Blender failed.
         """
         # The renderer: not for a mistyped key
         from eval.zoo.sheets import measured_sheets, sheet_rows
@@ -80,7 +82,10 @@ class Zoo(Benchmark):
         names = [light.name for light in lights]
         outcome.inputs["lights"] = names
         if not photographed(lights):
-            outcome.lack("zoo.ball.rough_error.venice", "no maps in benchmark.real_data: drawn ones light it")
+            outcome.lack(
+                "zoo.ball.rough_error.venice",
+                "drawn maps light it: give benchmark.real_data=FOLDER with hdri",
+            )
         for name in self.lights or []:
             if name not in names:
                 raise TronError(f"no light {name}", "benchmark.lights", f"they are {', '.join(names)}")

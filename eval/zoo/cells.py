@@ -1,8 +1,9 @@
-"""Cells of the zoo: one material on one shape under one light, by paths and by every way of TRON's.
+"""Cells of the zoo: one material on one shape under one light, path-traced and by every way of TRON.
 
-What counts are pixels that the shape fills: 16 rays of a pixel meet it. A pixel of the silhouette holds
-background too, by another filter in each renderer, and is left out; what the camera sees aslant is not. What
-surfels let through is divided out (:data:`HOLE`), so that a hole is dark only where most of a pixel is one.
+Only pixels that the shape fills count: all 16 rays of such a pixel hit it. Pixels of the silhouette are left
+out, because each renderer filters the background differently; surfaces at grazing angles are not left out.
+The result is divided by the surfels' opacity (:data:`HOLE`), so a hole is dark only if it covers most of a
+pixel.
 """
 
 from __future__ import annotations
@@ -46,14 +47,14 @@ class Cell:
     """One cell, measured.
 
     Attributes:
-        shape: its kind. number: of the individual.
-        material: on it. light: name of the light.
-        exposure: of its pictures.
-        covered: (H, W) share of a pixel's rays that meet the shape.
+        shape: its kind. number: number of the individual.
+        material: its material. light: name of the light.
+        exposure: exposure of the pictures.
+        covered: (H, W) share of a pixel's rays that hit the shape.
         truth: (H, W, 3) linear.
-        lit: quality -> (H, W, 3) linear, what the surfels let through divided out; by denoisers too, as
-            ``preview_oidn``, where they are there.
-        psnr: way -> dB of display values, those of the network among them.
+        lit: quality -> (H, W, 3) linear, divided by the surfels' opacity; with installed denoisers too, as
+            ``preview_oidn``.
+        psnr: way -> dB of display values, the network included.
     """
 
     shape: str
@@ -68,24 +69,24 @@ class Cell:
 
     @property
     def words(self) -> str:
-        """Such as ``leaf, metal 0.87 saturated, studio``."""
+        """Description, such as ``leaf, metal 0.87 saturated, studio``."""
         return f"{self.shape}, {self.material.words}, {self.light}"
 
     @property
     def counts(self) -> np.ndarray:
-        """(H, W) bool, pixels that count."""
+        """(H, W) bool: pixels that the shape fills."""
         return self.covered == 1
 
     def mean(self, way: str) -> float:
-        """Mean of ``lit`` over the truth's."""
+        """Return the mean of ``lit`` over the mean of the truth."""
         return float(self.lit[way][self.counts].mean() / self.truth[self.counts].mean())
 
     def error(self, way: str) -> float:
-        """Mean absolute difference from the truth over the truth's mean."""
+        """Return the mean absolute difference from the truth over the truth's mean."""
         return float(np.abs(self.lit[way] - self.truth)[self.counts].mean() / self.truth[self.counts].mean())
 
     def judge(self, way: str, shown: np.ndarray) -> None:
-        """Keep the PSNR of (H, W, 3) display values."""
+        """Store the PSNR of display values (H, W, 3)."""
         self.psnr[way] = capped_psnr(shown, to_display(self.truth, self.exposure), self.counts)
 
 
@@ -97,15 +98,15 @@ def measured(
     denoisers: Sequence[str],
     networks: Mapping[str, Network],
 ) -> Iterator[Cell]:
-    """Cells of an individual: every material under every light, whose shadows are traced once.
+    """Measure cells of an individual: every material under every light; shadows are traced once.
 
     Args:
         shape: the individual.
-        materials: on it.
-        lights: around it.
+        materials: its materials.
+        lights: its lights.
         seed: root of all random numbers.
-        denoisers: names of those that are tried, in one cell of :data:`TRIED`.
-        networks: by name, tried there too.
+        denoisers: names of denoisers, tried in one of :data:`TRIED` cells.
+        networks: name -> network, tried in the same cells.
     """
     start, first, baked = time.perf_counter(), None, dict[str, Illumination]()
     share = covered(shape)
@@ -145,7 +146,7 @@ def measured(
 
 
 def covered(shape: Shape) -> np.ndarray:
-    """(H, W) share of a pixel's rays that meet the shape.
+    """Return the share of a pixel's rays that hit the shape, (H, W).
 
     Raises:
         ValueError: no pixel is covered (a defect of the shape).
@@ -162,6 +163,6 @@ def covered(shape: Shape) -> np.ndarray:
 
 
 def _whole(frame: TracedFrame) -> np.ndarray:
-    """``lit`` of a frame as if its surfels were opaque."""
+    """Return ``lit`` of a frame as if its surfels were opaque."""
     dark, bright = (frame.shade([behind] * 3).lit for behind in (0.0, 1.0))
     return dark / np.maximum(1 - (bright - dark), HOLE)

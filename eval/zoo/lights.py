@@ -27,8 +27,8 @@ class Light:
     """A light of the zoo.
 
     Attributes:
-        name: in metrics.
-        environment: around the shapes.
+        name: name in metrics.
+        environment: environment of the shapes.
     """
 
     name: str
@@ -36,20 +36,20 @@ class Light:
 
     @cached_property
     def lighting(self) -> Lighting:
-        """The same, prepared for frames when first asked for."""
+        """The environment prepared for frames, on first use."""
         return Lighting(self.environment)
 
     @property
     def even(self) -> bool:
-        """Whether few paths tell the truth."""
+        """Whether few samples give the truth."""
         return self.name == EVEN
 
 
 def draw_lights(maps: Path | None, seed: int) -> list[Light]:
-    """Four maps, a sun and even light, each turned about up by chance.
+    """Draw four maps, a sun and even light, each turned about up at random.
 
     Args:
-        maps: folder of photographed maps (``.hdr``); where it lacks those of :data:`JUDGED`, maps are drawn.
+        maps: folder of photographed maps (``.hdr``); maps of :data:`JUDGED` that it lacks are drawn.
         seed: root of all random numbers.
     """
     rng = generator(seed, "zoo", "lights")
@@ -70,12 +70,12 @@ def draw_lights(maps: Path | None, seed: int) -> list[Light]:
 
 
 def photographed(lights: Sequence[Light]) -> bool:
-    """Whether the maps are those that targets name."""
+    """Whether the maps are the photographed maps of the targets."""
     return all(name in [each.name for each in lights] for name in JUDGED)
 
 
 def disc(elevation_deg: float, azimuth_deg: float, radius_deg: float) -> np.ndarray:
-    """(ROWS, 2 ROWS) in [0, 1]: a disc of the sphere whose edge is a texel and a half wide."""
+    """Return a disc of the sphere with an edge of 1.5 texels, (ROWS, 2 ROWS) in [0, 1]."""
     elevation, azimuth = np.radians([elevation_deg, azimuth_deg])
     level = np.cos(elevation)
     toward = np.array([level * np.cos(azimuth), level * np.sin(azimuth), np.sin(elevation)])
@@ -90,7 +90,7 @@ def _sky(rng: np.random.Generator, zenith: float, horizon: float, ground: float)
 
 
 def _sun(rng: np.random.Generator) -> EnvironmentMap:
-    """A disc of two degrees' radius, 10 to 70 above the horizon, of four fifths of the light."""
+    """Draw a disc of 2 degrees' radius, 10 to 70 degrees high, with four fifths of the light."""
     sky = _sky(rng, 0.3, 0.5, 0.12)
     lamp = disc(rng.uniform(10, 70), 0.0, 2.0)[..., None] * [1.05, 1.0, 0.9]
     share = EnvironmentMap(lamp).unoccluded_upward().mean() / EnvironmentMap(sky).unoccluded_upward().mean()
@@ -98,7 +98,7 @@ def _sun(rng: np.random.Generator) -> EnvironmentMap:
 
 
 def _windows(rng: np.random.Generator) -> EnvironmentMap:
-    """A dim room with three lamps or windows of a few degrees to a few dozen."""
+    """Draw a dim room with three lamps or windows, a few to a few dozen degrees wide."""
     light = _sky(rng, 0.25, 0.2, 0.1)
     for _ in range(3):
         radius = float(np.exp(rng.uniform(np.log(4), np.log(25))))

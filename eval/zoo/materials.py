@@ -34,7 +34,7 @@ WIDE_STRATA = ((0.05, 0.25), (0.25, 0.6), (0.6, 1.0))
 
 
 class Material(NamedTuple):
-    """Of one surface.
+    """Material of one surface.
 
     Attributes:
         color: kind of its base color, of :data:`BRIGHTNESS`.
@@ -50,14 +50,14 @@ class Material(NamedTuple):
 
     @property
     def words(self) -> str:
-        """Such as ``metal 0.87 saturated``."""
+        """Description, such as ``metal 0.87 saturated``."""
         return f"{'metal' if self.metallic else 'dielectric'} {self.roughness:.2f} {self.color}"
 
 
 def draw_materials(
     rng: np.random.Generator, strata: Sequence[tuple[float, float]], each: int = 1
 ) -> list[Material]:
-    """Metals, then dielectrics, ``each`` of every stratum of roughness; kinds of color take turns."""
+    """Draw metals, then dielectrics, ``each`` per stratum of roughness; kinds of color take turns."""
     count = 2 * each * len(strata)
     kinds: list[str] = []
     while len(kinds) < count:
@@ -71,6 +71,6 @@ def draw_materials(
 
 
 def _base_color(rng: np.random.Generator, kind: str) -> tuple[float, float, float]:
-    """Saturated, or with a tint of a tenth."""
+    """Draw a base color, saturated or with a tint of a tenth."""
     saturation = rng.uniform(0.8, 1) if kind == "saturated" else rng.uniform(0, 0.1)
     return colorsys.hsv_to_rgb(rng.random(), saturation, rng.uniform(*BRIGHTNESS[kind]))

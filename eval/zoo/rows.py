@@ -1,4 +1,4 @@
-"""Cells -> rows: the worst of all, each shape, balls by material and light, every way of TRON's."""
+"""Rows of cells: the worst of all, each shape, balls by material and light, every way of TRON."""
 
 from __future__ import annotations
 
@@ -17,7 +17,7 @@ BALL = "ball"
 
 
 def zoo_rows(cells: Sequence[Cell]) -> Iterator[Row]:
-    """All rows of cells; those of balls only where there are some."""
+    """Yield all rows of cells; rows of balls only if there are balls."""
     off = np.array([[abs(cell.mean(quality) - 1) for quality in QUALITIES] for cell in cells])
     errors = np.array([[cell.error(quality) for quality in QUALITIES] for cell in cells])
     yield _row("worst_mean", off.max(), len(cells))
@@ -45,7 +45,7 @@ def zoo_rows(cells: Sequence[Cell]) -> Iterator[Row]:
 
 
 def _ball_rows(balls: Sequence[Cell], lights: Sequence[str]) -> Iterator[Row]:
-    """What balls are held to, and means of groups of materials under each light."""
+    """Yield rows of the balls' targets, and means of groups of materials under each light."""
     preview = next(iter(QUALITIES))
     shiny = [(cell, preview) for cell in balls if cell.material.metallic and cell.material.roughness < ROUGH]
     others = [(cell, quality) for cell in balls for quality in QUALITIES if (cell, quality) not in shiny]
@@ -72,7 +72,7 @@ def _ball_rows(balls: Sequence[Cell], lights: Sequence[str]) -> Iterator[Row]:
 
 
 def group(cell: Cell) -> str:
-    """Such as ``metal_polished``: by what it is, and by its roughness."""
+    """Return the group of a material by kind and roughness, such as ``metal_polished``."""
     roughness = cell.material.roughness
     width = "polished" if roughness <= POLISHED else "rough" if roughness >= ROUGH else "middle"
     return f"{'metal' if cell.material.metallic else 'dielectric'}_{width}"

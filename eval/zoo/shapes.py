@@ -1,7 +1,7 @@
-"""Shapes of the zoo, each drawn anew by its random stream: triangles, a view, and how surfels stand on them.
+"""Random shapes of the zoo: triangles, a view, and the placement of surfels on them.
 
-All fit the unit ball around the origin, z up. A kind has several individuals, of other proportions, turned
-otherwise, and seen from elsewhere.
+All fit the unit ball around the origin, z up. A kind has several individuals, which differ in
+proportions, rotation and view.
 """
 
 from __future__ import annotations
@@ -46,7 +46,7 @@ class Shape:
     """One individual.
 
     Attributes:
-        kind: of :data:`KINDS`. number: among those of its kind.
+        kind: of :data:`KINDS`. number: number of the individual within its kind.
         parts: its surface, of any material.
         camera: its view.
         jitter: deviation of its surfels along their normals, in spacings.
@@ -63,11 +63,11 @@ class Shape:
     seed: int
 
     def of(self, material: Material) -> list[Part]:
-        """Its surface, of a material; a texture's base color is multiplied by the material's."""
+        """Return the surface in a material; a texture is multiplied by the material's base color."""
         return [of_material(part, material) for part in self.parts]
 
     def surfels(self, material: Material) -> GaussianScene:
-        """Surfels on it; of another material only their materials differ."""
+        """Return surfels on the shape; their geometry does not depend on the material."""
         parts = self.of(material)
         scene = surfels_of_model(two_sided(parts), SPACING, seed=self.seed)
         if self.fog:
@@ -77,11 +77,11 @@ class Shape:
 
 
 def individuals(kinds: Sequence[str], most: int | None, seed: int) -> Iterator[tuple[Shape, list[Material]]]:
-    """Shapes with their materials, in the order of the wall.
+    """Yield shapes with their materials, in the order of the wall.
 
     Args:
-        kinds: of shapes.
-        most: materials of an individual; None: all.
+        kinds: kinds of shapes.
+        most: maximum number of materials of an individual; None: all.
         seed: root of all random numbers.
     """
     for kind in kinds:
@@ -95,12 +95,12 @@ def individuals(kinds: Sequence[str], most: int | None, seed: int) -> Iterator[t
 
 
 def _some(materials: list[Material], most: int | None) -> list[Material]:
-    """At most so many, evenly."""
+    """Return at most so many items, evenly spaced."""
     return materials if most is None else materials[:: -(-len(materials) // most)]
 
 
 def draw_shape(kind: str, number: int, seed: int) -> Shape:
-    """An individual of a kind."""
+    """Draw an individual of a kind."""
     rng = generator(seed, "zoo", "shape", kind, number)
     drawn = KINDS[kind](rng, number)
     azimuth, elevation = np.radians([drawn.azimuth_deg, rng.uniform(*drawn.elevation_deg)])
@@ -113,7 +113,7 @@ def draw_shape(kind: str, number: int, seed: int) -> Shape:
 
 @dataclass(frozen=True)
 class _Drawn:
-    """What a kind decides; the parts have the base color that a material's is multiplied by."""
+    """Random draw of a kind; the base color of its parts multiplies the material's."""
 
     parts: list[Part]
     azimuth_deg: float
@@ -123,13 +123,13 @@ class _Drawn:
 
 
 def of_material(part: Part, material: Material) -> Part:
-    """The part, of a material."""
+    """Return the part in a material."""
     color = (part.base_color * np.array(material.base_color)).astype(np.float32)
     return replace(part, base_color=color, roughness=material.roughness, metallic=material.metallic)
 
 
 def fitted(parts: Sequence[Part]) -> list[Part]:
-    """Parts in the unit ball."""
+    """Scale parts into the unit ball."""
     corners = np.concatenate([part.vertices for part in parts])
     middle = (corners.min(0) + corners.max(0)) / 2
     radius = np.linalg.norm(corners - middle, axis=1).max()

@@ -171,6 +171,11 @@ def test_every_setting_is_described(folder: str):
     assert len(command.examples) >= 2
 
 
+@pytest.mark.parametrize("path", FILES, ids=lambda path: str(path.relative_to(ROOT)))
+def test_no_recipe_names_a_folder_beside_the_checkout(path: Path):
+    assert "../" not in path.read_text("utf-8")
+
+
 def undescribed(model: type[BaseModel], prefix: str = "") -> list[str]:
     names = []
     for name, field in model.model_fields.items():

@@ -332,8 +332,12 @@ def test_a_way_is_of_scenes_or_of_photos(stand_ins: Path, tmp_path: Path, capfd:
     assert "way random is of photos and of scenes" in capfd.readouterr().err
 
 
-def test_without_real_data_the_fox_has_no_rows_and_no_section(stand_ins: Path, tmp_path: Path):
-    assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={tmp_path / 'nowhere'}") == 0
+@pytest.mark.parametrize("real_data", ["null", "nowhere"])
+def test_without_real_data_the_fox_has_no_rows_and_no_section(
+    stand_ins: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, real_data: str
+):
+    assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={real_data}") == 0
+    assert "give benchmark.real_data=FOLDER" in caplog.text
     results = Results.load(tmp_path / "out" / "results.json")
     assert results.rows == []
     assert not stand_ins.exists()

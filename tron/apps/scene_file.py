@@ -45,13 +45,13 @@ FoundMaterials = Annotated[
 ]
 """Setting of a plain scan's materials."""
 GROUND = (
-    "level plane that shows the environment's ground and shadows of what stands there; auto: below a thing "
-    "that has no floor of its own; or its height along up, in the scene's units"
+    "level plane that shows the environment's ground and the shadows on it; auto: below a subject without a "
+    "floor of its own; a number: at this height along up, in the scene's units"
 )
 SURROUNDINGS = (
-    "splats far around the scene that shut out the light, such as a shell of sky: drop leaves them out; "
-    "background shows them behind the scene, lit, but frames nothing by them and has no shadow nor bounce of "
-    "theirs; keep treats them as all others. Walls of rooms and distant hills are none"
+    "splats far around the scene that block the light, such as a shell of sky (not walls of rooms or distant "
+    "hills); drop: remove them; background: show them behind the scene, lit, without shadows, bounced light "
+    "or influence on the framing; keep: treat them like all other splats"
 )
 
 

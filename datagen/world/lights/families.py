@@ -1,4 +1,4 @@
-"""The table of families: what a recipe may ask for, and what specifications are read as."""
+"""The table of light families: their names in recipes, and their specifications."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Base of the families of light: a distribution, a radiance, and the map that it is baked to.
+"""Base class of light families: a distribution, a radiance, and a baked map.
 
 Beside it what families share (directions, soft edges, tints, small bright discs).
 """
@@ -38,15 +38,15 @@ class Light(Spec):
 
     @classmethod
     def draw(cls, rng: np.random.Generator, files: Sequence[Light]) -> Light:
-        """Draw a light; ``files`` are the user's maps, for the family that takes one of them."""
+        """Draw a light; ``files`` are the user's maps, used by one family only."""
         raise NotImplementedError
 
     def radiance(self, directions: np.ndarray) -> np.ndarray:
-        """Linear radiance (N, 3) that comes from unit directions (N, 3), world, z up."""
+        """Return linear radiance (N, 3) from unit directions (N, 3), world, z up."""
         raise NotImplementedError
 
     def discs(self) -> Sequence[Disc]:
-        """Small bright sources that are added to the radiance, each with all of its light."""
+        """Return small bright sources, which are added to the map with their exact irradiance."""
         return ()
 
     def bake(self, height: int, environments: Path | None = None) -> EnvironmentMap:  # noqa: ARG002
@@ -111,7 +111,7 @@ class Disc:
 
 
 def lay(image: np.ndarray, discs: Iterable[Disc]) -> np.ndarray:
-    """The lat-long image (H, W, 3) with discs added: each gives its irradiance by the map's own integral."""
+    """Add discs to a lat-long image (H, W, 3) so that the map's own integral gives their irradiance."""
     environment = EnvironmentMap(image)
     height, width = image.shape[:2]
     area, directions = environment.solid_angles(), environment.directions()

@@ -1,4 +1,4 @@
-"""Box room seen from inside, as a light: what a direction meets, and the light that falls there.
+"""Box room as a light, seen from inside: ray casting, and irradiance on its surfaces.
 
 Metres; the corner of the room is the origin, z up. Direct light comes from rectangles and small lamps without
 shadows but the sun's; light that bounces is that of an integrating sphere of the room's area and mean albedo.
@@ -160,7 +160,7 @@ def bounced(flux: np.ndarray, size: np.ndarray, albedo: np.ndarray) -> np.ndarra
 
 
 def nearness(hits: Hits, size: np.ndarray, boxes: tuple[Box, ...]) -> np.ndarray:
-    """Share (N,) of bounced light that corners, and things on the floor, leave."""
+    """Return the share (N,) of bounced light that reaches places near corners and furniture."""
     gap = np.minimum(hits.points, size.astype(np.float32) - hits.points)
     dark = np.where(hits.normals != 0, 0.0, np.exp(-np.maximum(gap, 0.0) / CORNER)).sum(axis=1)
     share = 1.0 - 0.3 * np.minimum(dark, 1.5)

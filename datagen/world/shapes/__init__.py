@@ -70,7 +70,7 @@ def draw_shape(rng: np.random.Generator, kinds: Sequence[str], size: tuple[float
 
 
 def make_pieces(shape: ShapeSpec, edge: float = 0.05) -> list[Piece]:
-    """Build a shape's pieces, their edges at most ``edge`` world units long.
+    """Build a shape's pieces with edges of at most ``edge`` world units.
 
     Together they just fit the ball of radius ``shape.size`` around the origin of the object's frame; normals
     point outwards. Vertices are shared; :func:`split_creases` gives a mesh its shading normals. A piece
@@ -84,7 +84,7 @@ def make_pieces(shape: ShapeSpec, edge: float = 0.05) -> list[Piece]:
 
 
 def standing(shape: ShapeSpec) -> Standing:
-    """The free space over what things stand on, in the object's frame.
+    """Return the free space over a support, in the object's frame.
 
     Raises:
         TronError: no such kind, or nothing stands on it.

@@ -1,4 +1,4 @@
-"""A shape as data, and the kinds of shapes that there are.
+"""A shape as data, and the interface of kinds of shapes.
 
 A kind, a size, four proportions and a seed become triangle meshes, a piece for each material.
 """
@@ -96,7 +96,7 @@ def fit(parts: Parts, size: float, edge: float) -> list[Piece]:
 
 
 def frame(parts: Parts, size: float) -> tuple[np.ndarray, float]:
-    """Centre (3,) and scale that :func:`fit` moves points x by: (x - centre) * scale."""
+    """Return centre (3,) and scale of :func:`fit`: x -> (x - centre) * scale."""
     vertices = np.concatenate([_vertices(solid) for solid, _ in parts])
     centre = 0.5 * (vertices.min(axis=0) + vertices.max(axis=0))
     return centre, float(size / np.linalg.norm(vertices - centre, axis=1).max())

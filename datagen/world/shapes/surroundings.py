@@ -37,7 +37,7 @@ COBBLES = 161
 
 @dataclass(frozen=True)
 class Standing:
-    """Free space over what things stand on, in the frame of the shape.
+    """Free space over a support, in the frame of the shape.
 
     Attributes:
         low, high: (3,) corners of the space; ``low[2]`` is where things stand, ``high[2]`` infinite under
@@ -50,12 +50,12 @@ class Standing:
     heights: np.ndarray | None = None
 
     def moved(self, centre: np.ndarray, scale: float) -> Standing:
-        """The same space after ``(x - centre) * scale``."""
+        """Return the space after ``(x - centre) * scale``."""
         heights = None if self.heights is None else (self.heights - centre[2]) * scale
         return Standing((self.low - centre) * scale, (self.high - centre) * scale, heights)
 
     def height(self, points: np.ndarray) -> np.ndarray:
-        """(N,) height of the ground at points (N, 2), bilinear; beyond its rim that of the rim."""
+        """Return the height (N,) of the ground at points (N, 2), bilinear; the rim's height beyond it."""
         if self.heights is None:
             return np.full(len(points), self.low[2])
         share = (np.asarray(points) - self.low[:2]) / (self.high - self.low)[:2]
@@ -68,7 +68,7 @@ Space = Callable[[np.ndarray, np.random.Generator], Standing]
 
 @dataclass(frozen=True)
 class Surrounding(Kind):
-    """Kind that things stand on; ``standing`` gives the space in the units of ``build``."""
+    """Kind of support for things; ``standing`` returns the free space in the units of ``build``."""
 
     standing: Space = lambda _p, _rng: _over((1.0, 1.0), 0.0)
 

@@ -1,4 +1,4 @@
-"""Styles of scenes: what stands there, on what, and how it is filmed."""
+"""Styles of scenes: objects, their support, and camera paths."""
 
 from __future__ import annotations
 

@@ -1,4 +1,4 @@
-"""Things of the world, each with what it is made of, and what a style composes of them."""
+"""Things of the world with their materials, and compositions of things by styles."""
 
 from __future__ import annotations
 
@@ -42,7 +42,7 @@ names no materials: exporters leave it out, and scans and conversions by hand ne
 
 
 class Fixture(NamedTuple):
-    """Something that stands still, and the free space over it in the world."""
+    """A fixed object, and the free space over it in the world."""
 
     item: ObjectSpec
     ground: Standing
@@ -50,7 +50,7 @@ class Fixture(NamedTuple):
 
 @dataclass(frozen=True)
 class Thing:
-    """A thing that has no place yet.
+    """A thing without a place.
 
     Attributes:
         shape, materials, asset, size, unsaid: as an ObjectSpec has them.
@@ -65,7 +65,7 @@ class Thing:
     unsaid: bool = False
 
     def at(self, placement: Placement) -> ObjectSpec:
-        """The object that it is at a place."""
+        """Return the object at a place."""
         return ObjectSpec(
             shape=self.shape,
             materials=self.materials,
@@ -153,7 +153,7 @@ def draw_things(
 def placed(
     things: Sequence[Thing], placements: Sequence[Placement | None]
 ) -> tuple[tuple[ObjectSpec, ...], int]:
-    """The objects that found a place, and how many did not.
+    """Return the objects that found a place, and the number of objects that did not.
 
     Raises:
         TronError: none did, where there were some.
@@ -165,7 +165,7 @@ def placed(
 
 
 def top_of(objects: Sequence[ObjectSpec]) -> float:
-    """Height above the ground up to which objects reach at the most, world units, roughly."""
+    """Return an approximate upper bound of the objects' height above the ground, world units."""
     return max((item.placement.position[2] + 0.6 * item.size for item in objects), default=0.0)
 
 
@@ -175,7 +175,7 @@ Streams = Callable[[str], np.random.Generator]
 
 @dataclass(frozen=True)
 class Choice:
-    """Wishes of a recipe for a scene's objects.
+    """Settings of a recipe for a scene's objects.
 
     Attributes:
         assets: id -> mesh in a unit ball, z up, standing; empty means procedural shapes only.
