@@ -14,7 +14,7 @@ CODE = {
     "tron/captures": (5_175, 34),
     "tron/cli": (1_580, 8),
     "tron/editing": (2_080, 13),
-    "tron/gaussians": (3_750, 27),
+    "tron/gaussians": (3_745, 27),
     "tron/integrators": (1_000, 5),
     "tron/io": (3_785, 21),
     "tron/meshing": (350, 3),

@@ -81,11 +81,7 @@ class HelpPage:
             page += _described(field, self.width, max_lines=2, placeholder=" ...")
         for group, options in self.groups.items():
             if group == self.listed:
-                page += ["", f"{group}=NAME"]
-                gap = max(map(len, options)) + 4
-                for option, said in options.items():
-                    line = f"  {option}".ljust(gap) + said
-                    page += textwrap.wrap(line, self.width, max_lines=1, placeholder=" ...")
+                page += ["", f"{group}=NAME", *_table(options, self.width, max_lines=1, placeholder=" ...")]
             else:
                 line = f"{group}=NAME   {', '.join(options)}"
                 page += ["", *textwrap.wrap(line, self.width, subsequent_indent="    ")]
@@ -224,11 +220,11 @@ def _reflow(text: str, width: int) -> list[str]:
     return lines[:-1]
 
 
-def _table(rows: Mapping[str, str], width: int) -> list[str]:
+def _table(rows: Mapping[str, str], width: int, **at_most: Any) -> list[str]:
     gap = max((len(name) for name in rows), default=0) + 4
     lines: list[str] = []
     for name, text in rows.items():
         lines += textwrap.wrap(
-            text, width, initial_indent=f"  {name}".ljust(gap), subsequent_indent=" " * gap
+            text, width, initial_indent=f"  {name}".ljust(gap), subsequent_indent=" " * gap, **at_most
         ) or [f"  {name}"]
     return lines
