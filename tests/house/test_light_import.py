@@ -3,6 +3,7 @@
 import os
 import subprocess
 import sys
+from importlib import import_module
 
 import pytest
 
@@ -73,3 +74,9 @@ def test_help_shows_at_most_ten_settings_that_there_are(command: str):
 
 def test_the_suffixes_that_help_names_are_those_that_are_written():
     assert SPLATS == WRITTEN
+
+
+@pytest.mark.parametrize("package", ["captures", "editing", "reconstruction", "scans", "shards"])
+def test_names_that_a_package_imports_later_are_there(package: str):
+    module = import_module(f"tron.{package}")
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
