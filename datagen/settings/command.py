@@ -379,7 +379,7 @@ class Settings(ScaleSettings):
     )
     cluster: dict[str, Any] | None = Field(
         None,
-        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` "
+        description="Where scenes are made, see cluster=NAME; `tron-datagen cluster=NAME --help cluster` "
         "lists the keys of a cluster, conf/datagen/cluster explains them.",
     )
 

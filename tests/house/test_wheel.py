@@ -108,7 +108,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_nothing_else(wheel: Path
 def test_a_command_imports_ours_beside_decoys(installed: Path, tmp_path: Path, command: str):
     for name in PACKAGES:
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a decoy was imported')\n")
-    shown = start(installed, command, "--help", cwd=tmp_path)
+    shown = start(installed, command, "--help", "all", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert f"usage: {command}" in shown.stdout
     said = start(installed, "python", "-P", "-c", "import train.cli as m; print(m.__file__)", cwd=tmp_path)
