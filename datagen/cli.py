@@ -2,15 +2,9 @@
 
 from __future__ import annotations
 
-from datagen.equal_error import measure_equal_error
-from datagen.run.captures import CAMERAS, make_captures
-from datagen.run.cost import project
-from datagen.run.dataset import make
-from datagen.run.merge import merge
-from datagen.run.publish import publish
-from datagen.run.validate import validate
 from datagen.settings.command import Settings
 from tron.cli.command_line import command
+from tron.cli.installation import loading
 
 
 def main(settings: Settings) -> int:
@@ -28,6 +22,15 @@ def main(settings: Settings) -> int:
     equal_error.json. An interrupted run resumes. The exit code is 1 if a scene could not be made
     (failures.jsonl says why, that of captures lies among them) or if validation found a problem.
     """
+    with loading("tron-datagen"):  # not for --help or a mistyped key
+        from datagen.equal_error import measure_equal_error
+        from datagen.run.captures import CAMERAS, make_captures
+        from datagen.run.cost import project
+        from datagen.run.dataset import make
+        from datagen.run.merge import merge
+        from datagen.run.publish import publish
+        from datagen.run.validate import validate
+
     if settings.mode == "validate":
         return 1 if validate(settings.output_dir, settings.disjoint_from, settings.store) else 0
     if settings.mode == "plan":
@@ -51,6 +54,10 @@ cli = command(
     "conf.datagen",
     Settings,
     main,
+    shown=(
+        *("output_dir", "mode", "workers", "train.scenes", "test.scenes", "train.frames"),
+        *("train.width", "train.path_spp", "assets", "environments"),
+    ),
     examples=(
         "tron-datagen experiment=demo output_dir=outputs/dataset",
         "tron-datagen experiment=demo output_dir=outputs/mine assets=models environments=hdris workers=8",

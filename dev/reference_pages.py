@@ -1,4 +1,4 @@
-"""MkDocs hook that makes reference/: commands and settings from `--help`, Python from docstrings."""
+"""MkDocs hook that makes reference/: commands and settings from `--help all`, Python from docstrings."""
 
 import html
 import logging
@@ -45,13 +45,13 @@ def on_files(files: Files, config: MkDocsConfig) -> Files:
 
 
 def help_pages() -> dict[str, str]:
-    """Command -> what its `--help` prints, without the line on what is installed here."""
+    """Command -> what its `--help all` prints, without the line on what is installed here."""
     scripts = tomllib.loads((ROOT / "pyproject.toml").read_text("utf-8"))["project"]["scripts"]
     path = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH")]))
     pages = {}
     for name, entry in scripts.items():
         module, _, function = entry.partition(":")
-        program = f"from {module} import {function}; {function}(['--help'])"
+        program = f"from {module} import {function}; {function}(['--help', 'all'])"
         done = subprocess.run(
             [sys.executable, "-c", program],
             capture_output=True,
@@ -65,7 +65,7 @@ def help_pages() -> dict[str, str]:
 
 def commands(pages: dict[str, str]) -> str:
     """What each command does, its recipes, options and examples."""
-    text = ["# Commands", "", "Made from `--help`. The keys are in [Settings](settings.md)."]
+    text = ["# Commands", "", "Made from `--help all`. The keys are in [Settings](settings.md)."]
     for name, page in pages.items():
         purpose, *parts = PARAGRAPHS.split(page)
         shown = [part.rstrip() for part in parts if not part.startswith("keys (")]
@@ -75,7 +75,7 @@ def commands(pages: dict[str, str]) -> str:
 
 def settings(pages: dict[str, str]) -> str:
     """A table of keys for each command."""
-    text = ["# Settings", "", "Made from `--help`. `N` stands for the index of an item of a list."]
+    text = ["# Settings", "", "Made from `--help all`. `N` stands for the index of an item of a list."]
     for name, page in pages.items():
         (keys,) = (part for part in PARAGRAPHS.split(page) if part.startswith("keys ("))
         text += ["", f"## {name}", "", "| key | type | default | what it is |", "|---|---|---|---|"]

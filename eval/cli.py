@@ -89,7 +89,7 @@ def main(settings: Settings) -> int:
     benchmark = make(settings.benchmark, "benchmark")
     for name in ("dataset", "renderer", "pixel_mlp", "suite", "methods"):
         if getattr(settings, name) is not None and name not in type(benchmark).model_fields:
-            mend = f"leave it out; tron-eval benchmark={benchmark.name} --help lists what it takes"
+            mend = f"leave it out; tron-eval benchmark={benchmark.name} --help all lists what it takes"
             raise TronError(f"benchmark={benchmark.name} takes no {name}", mend=mend)
     benchmark.check()
     with locked(settings.output_dir):
@@ -144,6 +144,8 @@ cli = command(
     "conf.eval",
     Settings,
     main,
+    shown=("output_dir", "dataset", "renderer", "suite", "methods", "report", "threads", "seed"),
+    listed="benchmark",
     examples=(
         "tron-eval benchmark=demo output_dir=outputs/demo",
         "tron-eval report=docs/benchmarks/tracing",

@@ -24,6 +24,10 @@ cli = command(
     "conf.train",
     Settings,
     main,
+    shown=(
+        *("dataset", "output_dir", "max_seconds", "stages", "splits", "data.cache_gb"),
+        *("optimizer.learning_rate", "precision", "devices", "start_from"),
+    ),
     examples=(
         "tron-train experiment=demo dataset=outputs/demo/dataset output_dir=outputs/demo/renderer",
         "tron-train renderer=pixel_mlp max_seconds=300 dataset=DIR output_dir=outputs/pixel_mlp",

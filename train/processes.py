@@ -153,7 +153,7 @@ def _fabric(settings: Settings, devices: int | str, nodes: int, **more: Any) -> 
             accelerator=settings.accelerator,
             devices=devices,
             num_nodes=nodes,
-            precision=settings.precision,  # type: ignore[arg-type]
+            precision=settings.precision,
             **more,
         )
     except (MisconfigurationException, ValueError, RuntimeError) as error:

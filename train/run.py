@@ -316,7 +316,7 @@ def make_trainer(
         num_nodes=settings.nodes,
         strategy=_strategy(settings, processes),
         use_distributed_sampler=False,
-        precision=settings.precision,  # type: ignore[arg-type]
+        precision=settings.precision,
         gradient_clip_val=settings.optimizer.gradient_clip,
         val_check_interval=min(settings.validation.every, stage.steps),
         check_val_every_n_epoch=None,

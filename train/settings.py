@@ -13,6 +13,7 @@ from tron.neural.shipped import SHIPPED
 from tron.shards.dataset_folder import DatasetPlace
 
 LoggerName = Literal["csv", "tensorboard", "wandb"]
+Precision = Literal["32-true", "bf16-mixed", "bf16-true", "16-mixed", "16-true", "64-true"]
 
 HELD_OUT = "test"
 """The split used by evaluation; splits whose names begin with it, such as test_relit, are too."""
@@ -241,7 +242,7 @@ class Settings(BaseModel):
         ge=1,
         description="Number of machines; start the command on each, by torchrun or srun.",
     )
-    precision: str = Field(default="32-true", description="Lightning precision, e.g. 32-true or bf16-mixed.")
+    precision: Precision = Field(default="32-true", description="Precision of training, as Lightning has it")
     strategy: Literal["auto", "ddp", "fsdp"] = Field(
         default="auto",
         description="How processes share the work: ddp (auto means this) keeps all weights in each; fsdp "

@@ -12,7 +12,6 @@ from dataclasses import dataclass
 from typing import Protocol, TypeVar
 
 import numpy as np
-from scipy.ndimage import label
 
 from tron.errors import TronError
 
@@ -109,6 +108,8 @@ def _joined(points: np.ndarray, core: np.ndarray, cell: float) -> np.ndarray:
     held = np.zeros(place.max(0) + 1, int)
     np.add.at(held, tuple(place.T), 1)
     parts = np.empty(held.shape, int)
+    from scipy.ndimage import label
+
     label(held >= _CROWD, np.ones((3, 3, 3)), output=parts)
     part = parts[tuple(place.T)]
     return core | ((part > 0) & (part == np.bincount(part[core]).argmax()))

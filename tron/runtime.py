@@ -14,12 +14,14 @@ import re
 import subprocess
 import sys
 from pathlib import Path
-from typing import Annotated, Any, Literal, TypeVar
+from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import Field
 
 from tron.errors import TronError
+
+if TYPE_CHECKING:
+    import numpy as np
 
 Variant = Annotated[
     Literal["llvm_ad_rgb", "cuda_ad_rgb"], Field(description="Mitsuba variant: processor or NVIDIA GPU")
@@ -290,6 +292,8 @@ def aligned(array: np.ndarray) -> np.ndarray:
     gathers of four numbers one by one. NumPy's memory begins at any multiple of 16, by chance, so the same
     call would now and then compile another and slower kernel.
     """
+    import numpy as np
+
     array = np.ascontiguousarray(array)
     memory = np.empty(array.nbytes + 2 * ALIGNMENT, np.uint8)
     first = -memory.ctypes.data % ALIGNMENT
@@ -301,6 +305,7 @@ def aligned(array: np.ndarray) -> np.ndarray:
 def lanes(kind: type[T], rows: np.ndarray) -> T:
     """Rows (N, C), float32, on the device: a Dr.Jit vector ``kind``, such as mi.Point3f, of N lanes."""
     import drjit as dr
+    import numpy as np
 
     number = dr.value_t(kind)
     return kind(*(number(aligned(column.astype(np.float32))) for column in rows.T))

@@ -14,7 +14,6 @@ from dataclasses import replace
 from typing import Any, Literal, NotRequired, TypedDict, Unpack
 
 import numpy as np
-from scipy.spatial.transform import Rotation, Slerp
 
 from tron.cameras import Camera
 from tron.errors import TronError
@@ -153,6 +152,8 @@ def keyframed(cameras: Sequence[Camera], n: int) -> list[Camera]:
     keys = np.arange(len(cameras), dtype=np.float64)
     times = _fractions(n) * keys[-1]
     matrices = [camera.world_to_camera[:3, :3] for camera in cameras]
+    from scipy.spatial.transform import Rotation, Slerp
+
     rotations = Slerp(keys, Rotation.from_matrix(matrices))(times)
     values = [(*camera.position, camera.fx, camera.fy, camera.cx, camera.cy) for camera in cameras]
     tracks = np.stack([np.interp(times, keys, track) for track in np.transpose(values)], axis=1)

@@ -8,9 +8,8 @@ from typing import Annotated, Any, Literal
 
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from datagen.settings import SettingsModel
+from datagen.settings import LightChoice, SettingsModel
 from datagen.settings.split import Rays
-from datagen.world.lights import LightChoice
 from tron.captures.load import CaptureSettings as PhotoSettings
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 

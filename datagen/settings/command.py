@@ -16,11 +16,10 @@ from pydantic import (
     model_validator,
 )
 
-from datagen.settings import SettingsModel
+from datagen.settings import Family, LightChoice, SettingsModel
 from datagen.settings.captures import CapturedSettings, CaptureSettings, PseudoCaptureSettings
 from datagen.settings.split import SplitSettings, SurfelReconstruction, SurfelSources
 from datagen.settings.surfels import AUTO, Auto, SurfelBudget, surfels_by_pixels
-from datagen.world.lights import Family, LightChoice
 from tron.errors import TronError
 from tron.estimation import FINAL, FINEST, PREVIEW, Brdf, Estimation, Estimator, require_bounces
 from tron.run_folder import leaves
@@ -180,12 +179,14 @@ class Settings(ScaleSettings):
     captured: CapturedSettings = Field(
         default_factory=lambda: CapturedSettings(), description="Training pairs of captures."
     )
+    # Those with words of registries are not checked, which would import these.
     train: SplitSettings = Field(SplitSettings(scenes=16), description="First training split.")
     train_b: SplitSettings = Field(
-        SplitSettings(scenes=4, style="object"), description="Second training split, of another distribution."
+        SplitSettings.model_construct(scenes=4, style="object"),
+        description="Second training split, of another distribution.",
     )
     validation: SplitSettings = Field(
-        SplitSettings(scenes=2, lights=["any"] * 2),
+        SplitSettings.model_construct(scenes=2, lights=["any"] * 2),
         description="Scenes for the PSNR shown during training; networks are not trained on them.",
     )
     test: SplitSettings = Field(
@@ -378,7 +379,7 @@ class Settings(ScaleSettings):
     )
     cluster: dict[str, Any] | None = Field(
         None,
-        description="Where scenes are made, see cluster=NAME below; `tron-datagen cluster=NAME --help` "
+        description="Where scenes are made, see cluster=NAME; `tron-datagen cluster=NAME --help cluster` "
         "lists the keys of a cluster, conf/datagen/cluster explains them.",
     )
 

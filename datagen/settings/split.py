@@ -8,11 +8,7 @@ from typing import Annotated, Any, Literal
 import numpy as np
 from pydantic import Field, PositiveInt, ValidationInfo, field_validator, model_validator
 
-from datagen.settings import SettingsModel
-from datagen.world.lights import LightChoice
-from datagen.world.materials import ProceduralName
-from datagen.world.shapes import ThingName
-from datagen.world.styles import STYLES, StyleChoice
+from datagen.settings import LightChoice, ProceduralName, SettingsModel, StyleChoice, ThingName
 from tron.seeds import generator
 
 Rays = Annotated[int, Field(ge=2, multiple_of=2)] | Literal["preview", "final"]
@@ -150,6 +146,8 @@ class SplitSettings(SettingsModel):
     def _counts_every_scene(cls, value: Any, info: ValidationInfo) -> Any:
         if not isinstance(value, dict):
             return value
+        from datagen.world.styles import STYLES
+
         if unknown := [name for name in value if name not in ("mixed", *STYLES)]:
             raise ValueError(f"no style '{unknown[0]}'; there are mixed, {', '.join(STYLES)}")
         scenes = info.data.get("scenes")

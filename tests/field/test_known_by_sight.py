@@ -15,7 +15,7 @@ import plyfile
 import pytest
 from PIL import Image
 
-from tron.apps.relight.command import cli as relight
+from tron.apps.relight.cli import cli as relight
 from tron.apps.splat_file import splat_file
 from tron.captures import load_capture
 from tron.captures.photos.photo_files import decode_photo, inspect_photo

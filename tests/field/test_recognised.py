@@ -16,8 +16,8 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tron.apps.reconstruct.command import cli as reconstruct
-from tron.apps.relight.command import cli as relight
+from tron.apps.reconstruct.cli import cli as reconstruct
+from tron.apps.relight.cli import cli as relight
 from tron.cameras import Camera
 from tron.captures import load_capture
 from tron.captures.load import FORMATS
@@ -185,7 +185,7 @@ def test_an_empty_folder_and_one_around_a_capture(tmp_path: Path) -> None:
 def test_photos_beside_poses_that_are_not_read_are_posed_anew_with_a_line(
     tmp_path: Path, monkeypatch, caplog, poses: str
 ) -> None:
-    monkeypatch.setattr("tron.captures.load.assemble", lambda *_: "assembled")
+    monkeypatch.setattr("tron.captures.assembly.assemble", lambda *_: "assembled")
     monkeypatch.setitem(FORMATS, "photos", replace(FORMATS["photos"], read=lambda *_: "posed"))
     given = tmp_path / "photos"
     if poses == "polycam":

@@ -3,7 +3,8 @@
 import numpy as np
 import pytest
 
-from tron.apps.reconstruct.splat_capture import SplatSettings, film_splats
+from tron.apps.reconstruct.settings import SplatSettings
+from tron.apps.reconstruct.splat_capture import film_splats
 from tron.cameras import Camera
 from tron.estimation import Estimation
 from tron.framing import even_directions

@@ -1,7 +1,16 @@
 """A script that asks for a version, and help, wait for neither torch nor Mitsuba."""
 
+import os
 import subprocess
 import sys
+from importlib import import_module
+
+import pytest
+
+from tron.apps.splat_file import SPLATS
+from tron.cli import installation
+from tron.cli.recipes import field_keys
+from tron.gaussians.formats.registry import WRITTEN
 
 HEAVY = {"mitsuba", "drjit", "torch", "lightning", "diffusers", "torchmetrics", "hydra"}
 GROUND = "errors seeds storage io.images color cameras trajectories metrics runtime io.video"
@@ -20,14 +29,57 @@ def test_imports_load_neither_renderer_nor_torch():
     assert not (HEAVY | {"cv2", "pycolmap"}) & captures
 
 
-def test_help_of_training_waits_for_no_torch():
-    program = (
-        "import sys; from train.cli import cli\n"
-        "try: cli(['--help'])\n"
-        "except SystemExit: print('loaded', {'torch', 'diffusers', 'lightning'} & set(sys.modules))"
-    )
-    done = subprocess.run([sys.executable, "-c", program], capture_output=True, text=True, check=True)
-    assert done.stdout.splitlines()[-1] == "loaded set()"
+COMMANDS = [
+    "relight",
+    "edit",
+    "bake",
+    "environment",
+    "export",
+    "view",
+    "reconstruct",
+    "datagen",
+    "train",
+    "evaluate",
+]
+UNASKED = ("mitsuba", "drjit", "torch", "scipy", "pycolmap", "lightning")
+PROGRAM = """
+import sys
+from tron.cli import installation
+try: getattr(installation, sys.argv[1])(sys.argv[2:])
+except SystemExit as end: print(end.code, *sys.modules)
+"""
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_is_short_and_it_and_a_mistyped_key_wait_for_no_library(command: str):
+    for words, code in ((["--help"], "0"), (["outptu_dri=there"], "2")):
+        done = subprocess.run(
+            [sys.executable, "-c", PROGRAM, command, *words],
+            capture_output=True, text=True, check=True, env=os.environ | {"COLUMNS": "200"},
+        )  # fmt: skip
+        *page, end = done.stdout.splitlines()
+        assert end.split()[0] == code, done.stderr
+        loaded = {each.partition(".")[0] for each in end.split()}
+        assert [each for each in UNASKED if each in loaded] == []
+        assert len(page) <= 60
+        assert [line for line in page if len(line) > 110] == []
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_help_shows_at_most_ten_settings_that_there_are(command: str):
+    known = getattr(installation, command).load()
+    assert 5 < len(known.shown) <= 10
+    assert set(known.shown) <= set(field_keys(known.settings))
+
+
+def test_the_suffixes_that_help_names_are_those_that_are_written():
+    assert SPLATS == WRITTEN
+
+
+@pytest.mark.parametrize("package", ["captures", "editing", "reconstruction", "scans", "shards"])
+def test_names_that_a_package_imports_later_are_there(package: str):
+    module = import_module(f"tron.{package}")
+    assert [name for name in module.__all__ if not hasattr(module, name)] == []
 
 
 def test_a_scan_is_lit_and_its_materials_are_found_without_torch():

@@ -108,7 +108,7 @@ def test_the_wheel_holds_every_module_and_data_file_and_nothing_else(wheel: Path
 def test_a_command_imports_ours_beside_decoys(installed: Path, tmp_path: Path, command: str):
     for name in PACKAGES:
         (tmp_path / f"{name}.py").write_text("raise SystemExit('a decoy was imported')\n")
-    shown = start(installed, command, "--help", cwd=tmp_path)
+    shown = start(installed, command, "--help", "all", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     assert f"usage: {command}" in shown.stdout
     said = start(installed, "python", "-P", "-c", "import train.cli as m; print(m.__file__)", cwd=tmp_path)
@@ -145,7 +145,7 @@ def test_a_foreign_file_of_one_of_our_names_is_one_clear_line(
 def test_a_module_run_beside_a_foreign_conf_says_so_too(installed: Path, tmp_path: Path):
     """`python -m` puts the current folder first on the path."""
     (tmp_path / "conf.py").touch()
-    refused = start(installed, "python", "-m", "tron.apps.relight.command", "--help", cwd=tmp_path)
+    refused = start(installed, "python", "-m", "tron.apps.relight.cli", "--help", cwd=tmp_path)
     assert refused.returncode == 2
     (line,) = refused.stderr.splitlines()
     assert line.startswith("tron-relight: this file hides TRON's own package 'conf'")
@@ -194,7 +194,7 @@ def test_a_command_whose_extra_is_missing_says_so(smallest: Path, tmp_path: Path
 
 @pytest.mark.parametrize("command", sorted(COMMANDS))
 def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp_path: Path, command: str):
-    shown = start(smallest, command, "--help", cwd=tmp_path)
+    shown = start(smallest, command, "--help", "all", cwd=tmp_path)
     assert shown.returncode == 0, shown.stderr
     installed = command in (
         "tron-relight",

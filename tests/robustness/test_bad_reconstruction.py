@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tron.apps.reconstruct.command import cli
+from tron.apps.reconstruct.cli import cli
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from tron.apps.reconstruct.command import cli
+from tron.apps.reconstruct.cli import cli
 from tron.cameras import Camera
 from tron.gaussians import GaussianScene
 from tron.io.video import VideoWriter

@@ -10,7 +10,9 @@ import sys
 import time
 from collections.abc import Callable
 from pathlib import Path
+from typing import get_args
 
+import lightning
 import pytest
 import torch
 import yaml
@@ -22,7 +24,7 @@ from train.checkpoints import find_position
 from train.cli import main
 from train.curriculum import Stage
 from train.processes import Processes, launch
-from train.settings import Settings
+from train.settings import Precision, Settings
 from tron.cli.recipes import check, compose_recipe
 from tron.errors import TronError
 from tron.storage import locked
@@ -310,7 +312,6 @@ def test_processes_that_train_for_a_time_keep_the_same_weights_and_stop_together
         ({"devices": 10_000}, r"devices=10000 of accelerator cpu: this machine has \d+ cores"),
         ({"nodes": 2}, "nodes=2 without a launcher: start it by torchrun"),
         ({"accelerator": "abacus"}, "invalid accelerator name"),
-        ({"precision": "7-bit"}, "precision=7-bit"),
     ],
 )
 def test_devices_that_a_machine_has_not_are_one_line(make_settings, dataset, tmp_path, changes, message):
@@ -326,10 +327,15 @@ def test_a_gpu_that_is_not_there_is_one_line(make_settings, dataset, tmp_path):
         main(Settings.model_validate(make_settings(dataset, tmp_path, accelerator="gpu")))
 
 
-def test_a_number_of_devices_that_is_none_is_one_line():
-    overrides = ["dataset=d", "output_dir=o", "devices=1.5"]
-    with pytest.raises(TronError, match="wrong value for 'devices'"):
-        check(compose_recipe("conf.train", Settings, overrides), Settings)
+@pytest.mark.parametrize("given", ["devices=1.5", "precision=fp16"])
+def test_a_number_of_devices_or_a_precision_that_is_none_is_one_line(given):
+    with pytest.raises(TronError, match=f"wrong value for '{given.partition('=')[0]}'"):
+        check(compose_recipe("conf.train", Settings, ["dataset=d", "output_dir=o", given]), Settings)
+
+
+@pytest.mark.parametrize("precision", get_args(Precision))
+def test_every_precision_is_one_of_lightnings(precision):
+    assert lightning.Fabric(accelerator="cpu", precision=precision)
 
 
 def test_more_devices_than_torchrun_has_started_are_one_line(monkeypatch, make_settings, dataset, tmp_path):

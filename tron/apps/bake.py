@@ -7,19 +7,15 @@ from functools import partial
 from pathlib import Path
 from typing import Annotated, Literal
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.scene_file import SURROUNDINGS, FoundMaterials, SeenAs, Up, check_scene_files
-from tron.apps.splat_file import SceneFile
+from tron.apps.splat_file import SPLATS, SceneFile
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.color import Look
-from tron.gaussians.formats.registry import WRITTEN
-from tron.gaussians.splat_files import check_count, check_suffix, write_splats
 from tron.runtime import Threads, Variant, activate
-from tron.scans import Scan
-from tron.scans.surroundings import Treatment
+from tron.scans import Treatment
 
 log = logging.getLogger(__name__)
 
@@ -40,7 +36,7 @@ class Settings(BaseModel):
         "tron-environment reads"
     )
     output: Path = Field(
-        description=f"file to write, or to replace, not the scene's own: {', '.join(WRITTEN)}"
+        description=f"file to write, or to replace, not the scene's own: {', '.join(SPLATS)}"
     )
     rotation: float = Field(
         0.0, description="rotation of the environment about up, degrees, counter-clockwise seen from above"
@@ -69,8 +65,12 @@ def main(settings: Settings) -> None:
     values: viewers show them as they are. Reflections sharper than harmonics are blurred. The file has 3DGS'
     kernel and properties, in the scene's own frame; materials stay in the scene.
     """
-    # Mitsuba: not for --help or a mistyped key
+    # not for --help or a mistyped key
+    import numpy as np
+
+    from tron.gaussians.splat_files import check_count, check_suffix, write_splats
     from tron.relighting.baking import baked
+    from tron.scans.scan import Scan
     from tron.shading.environments.environment import EnvironmentMap
 
     check_suffix(settings.output)
@@ -114,9 +114,14 @@ cli = command(
     "conf.bake",
     Settings,
     main,
+    shown=(
+        *("scene", "environment", "output", "rotation", "exposure", "look", "surroundings"),
+        *("proxy", "up", "materials"),
+    ),
     examples=(
         "tron-bake scene=surfels.ply environment=studio.hdr output=relit.ply",
         "tron-bake scene=scan.ply environment=sunset.hdr rotation=90 up=[0,0,1] output=evening.ply",
+        "tron-bake scene=scan.ply environment=studio.hdr surroundings=keep look=none output=plain.spz",
     ),
     ended="no file was written; materials and a proxy that were found for a scan are kept",
 )

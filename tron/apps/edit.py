@@ -6,27 +6,24 @@ import json
 import logging
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Annotated
+from typing import TYPE_CHECKING, Annotated
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.scene_file import FoundMaterials, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import ANEW, command
 from tron.cli.progress import track, working
-from tron.editing import Edit, EditList, Insert, Material, Views
 from tron.errors import TronError
-from tron.gaussians.scene import GaussianScene
-from tron.io.cameras.registry import cameras_of
-from tron.scans import Scan
-from tron.scans.camera_files import CAMERAS, in_frame_of
-from tron.scans.scan import LIGHT
 from tron.storage import write_atomic
+
+if TYPE_CHECKING:
+    from tron.editing import Edit, EditList, Views
+    from tron.gaussians.scene import GaussianScene
 
 log = logging.getLogger(__name__)
 
-CAMERAS_FILES = (CAMERAS, "transforms.json")
+CAMERAS_FILES = ("cameras.json", "transforms.json")
 SHOWN_OBJECTS = 20
 
 
@@ -78,6 +75,9 @@ def main(settings: Settings) -> None:
     materials, which are found first as by tron-relight, and in another folder its cameras.json and
     environment.exr. The same is in Python: tron.editing.
     """
+    from tron.editing import Insert, Material  # not for --help or a mistyped key
+    from tron.scans.scan import Scan
+
     if settings.output.suffix.lower() != ".ply":
         mend = "give it a name that ends with .ply; tron-export makes other files of that"
         raise TronError("output is no PLY", settings.output, mend)
@@ -118,6 +118,9 @@ def _cameras_file(settings: Settings) -> Path | None:
 
 def _keep_beside(scene: Path, output: Path) -> None:
     """Let a scene's cameras and the light of its capture, where they lie beside it, lie beside the output."""
+    from tron.scans.camera_files import CAMERAS
+    from tron.scans.scan import LIGHT
+
     for name in (CAMERAS, LIGHT):
         own, there = (path.with_name(name) for path in (scene, output))
         known, found = (path.read_bytes() if path.is_file() else None for path in (own, there))
@@ -138,6 +141,8 @@ def _files(settings: Settings) -> tuple[Path, ...]:
 
 def _read(settings: Settings) -> tuple[EditList, str]:
     """All edits, and what messages call them."""
+    from tron.editing import EditList
+
     first, *others = _files(settings)
     edits = EditList.read(first)
     for path in others:
@@ -146,6 +151,10 @@ def _read(settings: Settings) -> tuple[EditList, str]:
 
 
 def _views(settings: Settings, scene: GaussianScene) -> Views:
+    from tron.editing import Views
+    from tron.io.cameras.registry import cameras_of
+    from tron.scans.camera_files import CAMERAS, in_frame_of
+
     path = _cameras_file(settings) or settings.scene.with_name(CAMERAS)
     if settings.cameras is None and not path.is_file():
         return Views()
@@ -181,6 +190,8 @@ def _said(edits: Iterable[Edit]) -> Iterator[Edit]:
 
 def _describe(scene: GaussianScene) -> None:
     """Say which objects there are, so that edits can name them."""
+    import numpy as np
+
     ids, counts = np.unique(scene.object_id, return_counts=True)
     for number, count in list(zip(ids, counts))[:SHOWN_OBJECTS]:
         means = scene.means[scene.object_id == number]
@@ -195,6 +206,7 @@ cli = command(
     "conf.edit",
     Settings,
     main,
+    shown=("scene", "edits", "output", "cameras", "materials", "up"),
     examples=(
         "tron-edit scene=surfels.ply edits=edits.yaml output=edited.ply",
         "tron-edit scene=scan.ply edits=clicks.yaml cameras=capture/transforms.json output=cut.ply",

@@ -146,6 +146,7 @@ cli = command(
     "conf.environment",
     Settings,
     main,
+    shown=("environment", "output", "picture", "rotation", "height", "layout", "crop", "distance"),
     examples=(
         "tron-environment environment=sky_cross.hdr output=sky.exr picture=sky.png",
         "tron-environment environment=cube.ktx2 output=studio.hdr rotation=90 height=1024",

@@ -10,21 +10,12 @@ from typing import Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from tron.apps.scene_file import SeenAs, Up, check_output, check_scene_files
-from tron.apps.splat_file import SceneFile
+from tron.apps.splat_file import SPLATS, SceneFile
 from tron.cli.command_line import ANEW, command
 from tron.cli.installation import loading
 from tron.cli.progress import track, working
 from tron.errors import TronError
-from tron.gaussians.edit import KERNEL_WIDTHS
-from tron.gaussians.formats.registry import WRITTEN
-from tron.gaussians.scene import GaussianScene
-from tron.gaussians.splat_files import check_suffix, write_points, write_splats
-from tron.io.cameras.registry import UPRIGHT, cameras_of, check_camera_file, write_camera_file
-from tron.io.local_frame import moved_cameras
 from tron.runtime import Threads, Variant, activate
-from tron.scans import Scan
-from tron.scans.camera_files import in_frame_of
-from tron.trajectories import turn_cameras
 
 log = logging.getLogger(__name__)
 
@@ -41,7 +32,7 @@ class Settings(BaseModel):
     scene: SceneFile = Field(description="the scene: a PLY of TRON, 3DGS or 2DGS, or another file of splats")
     output: Path = Field(
         description=f"file to write, or to replace, not the scene's own; its name says the format: "
-        f"{', '.join(MESHES)}, a mesh with textures; {', '.join(WRITTEN)}, splats; .ply, points too"
+        f"{', '.join(MESHES)}, a mesh with textures; {', '.join(SPLATS)}, splats; .ply, points too"
     )
     kind: Kind | None = Field(None, description="null: a mesh in .glb and .usdz, splats in all others")
     cameras: Path | None = Field(
@@ -81,10 +72,12 @@ def main(settings: Settings) -> None:
     if settings.cameras is not None:
         _write_cameras(settings, settings.cameras)
         return
+    from tron.gaussians.splat_files import check_suffix  # not for --help or a mistyped key
+
     check_suffix(settings.output)
     suffix = settings.output.suffix.lower()
     kind = settings.kind or ("mesh" if suffix in MESHES else "splats")
-    fitting = {"mesh": MESHES, "splats": WRITTEN, "points": POINTS}[kind]
+    fitting = {"mesh": MESHES, "splats": SPLATS, "points": POINTS}[kind]
     if suffix not in fitting:
         raise TronError(f"{suffix} holds no {kind}", settings.output, f"{kind}: {', '.join(fitting)}")
     check_scene_files(settings.scene, settings.output)
@@ -92,6 +85,12 @@ def main(settings: Settings) -> None:
 
 
 def _write_cameras(settings: Settings, file: Path) -> None:
+    from tron.io.cameras.registry import UPRIGHT, cameras_of, check_camera_file, write_camera_file
+    from tron.io.local_frame import moved_cameras
+    from tron.scans.camera_files import in_frame_of
+    from tron.scans.scan import Scan
+    from tron.trajectories import turn_cameras
+
     check_camera_file(settings.output)
     check_scene_files(settings.scene, settings.output, file)
     check_output(settings.output, file, "the file of cameras")
@@ -109,6 +108,10 @@ def _write_cameras(settings: Settings, file: Path) -> None:
 
 
 def _write_splats(settings: Settings) -> None:
+    from tron.gaussians.edit import KERNEL_WIDTHS
+    from tron.gaussians.scene import GaussianScene
+    from tron.gaussians.splat_files import write_splats
+
     with working("reading the scene"):
         scene = GaussianScene.load(settings.scene)
     if scene.kernel_degree != 2:
@@ -122,6 +125,9 @@ def _write_splats(settings: Settings) -> None:
 
 
 def _write_points(settings: Settings) -> None:
+    from tron.gaussians.scene import GaussianScene
+    from tron.gaussians.splat_files import write_points
+
     with working("reading the scene"):
         scene = GaussianScene.load(settings.scene)
     _log_written(settings, f"{write_points(settings.output, scene)} points")
@@ -134,6 +140,7 @@ def _write_mesh(settings: Settings) -> None:
             from tron.meshing.surface import surface_of, views_of
             from tron.meshing.textures import textured
             from tron.models.write import write_glb, write_usdz
+            from tron.scans.scan import Scan
             from tron.tracing.tracer import SurfelTracer
     except ModuleNotFoundError as error:
         what = f"{error.name} is not installed, which makes meshes"
@@ -158,6 +165,7 @@ cli = command(
     "conf.export",
     Settings,
     main,
+    shown=("scene", "output", "kind", "cameras", "fps", "triangles", "texture", "projection", "up"),
     examples=(
         "tron-export scene=scene/scene.ply output=scene.glb",
         "tron-export scene=surfels.ply output=surfels.spz",

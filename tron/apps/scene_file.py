@@ -9,7 +9,6 @@ from typing import Annotated, Literal
 from pydantic import AfterValidator, Field
 
 from tron.errors import TronError
-from tron.gaussians.formats.registry import check_header, refuse_foreign
 from tron.io.recognised import refuse_by_sight
 
 
@@ -67,6 +66,8 @@ def check_scene_files(scene: Path, output: Path, *read: Path | None) -> None:
     Raises:
         TronError: it is not so.
     """
+    from tron.gaussians.formats.registry import check_header, refuse_foreign
+
     for path in (scene, *read):
         if path is not None:
             require_file(path)

@@ -12,8 +12,6 @@ from typing import IO, Annotated
 from pydantic import AfterValidator
 
 from tron.errors import TronError
-from tron.gaussians.formats.registry import check_header, named_as_splats
-from tron.gaussians.formats.sog import sog_file
 from tron.storage import atomic_path
 
 log = logging.getLogger(__name__)
@@ -39,6 +37,8 @@ def splat_file(path: Path) -> Path:
         TronError: there are several, or an archive is damaged, too large or cannot be unpacked.
     """
     if path.is_dir():
+        from tron.gaussians.formats.sog import sog_file
+
         found = sog_file(path) or _only(path, [str(each) for each in _splats_in(path)])
         return path if found is None else Path(found)
     if path.is_file() and path.name.lower().endswith(_ARCHIVES):
@@ -46,11 +46,15 @@ def splat_file(path: Path) -> Path:
     return path
 
 
+SPLATS = (".ply", ".splat", ".spz", ".sog", ".glb", ".usd", ".usda", ".usdc", ".usdz")
+"""Suffixes of files that are written: those of the registry of formats, which help does not wait for."""
 SceneFile = Annotated[Path, AfterValidator(splat_file)]
 """Setting of a scene's file."""
 
 
 def _named(name: str) -> bool:
+    from tron.gaussians.formats.registry import named_as_splats
+
     return named_as_splats(name) and not name.startswith(".") and not name.lower().endswith(_OURS)
 
 
@@ -66,6 +70,8 @@ def _splats_in(folder: Path) -> list[Path]:
 def _is_splats(path: Path) -> bool:
     """Whether a file that is named as one holds splats: meshes and points do not."""
     try:
+        from tron.gaussians.formats.registry import check_header
+
         check_header(path)
     except TronError:
         return False

@@ -14,10 +14,8 @@ from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.errors import TronError
-from tron.io.lights import LIGHT_SUFFIXES
 from tron.runtime import Threads, Variant, activate
-from tron.scans import Scan
-from tron.scans.scan import GroundChoice, is_of_capture
+from tron.scans import GroundChoice
 
 if TYPE_CHECKING:
     from tron.view.window import Window
@@ -92,6 +90,8 @@ def opened(settings: Settings) -> Window:
         TronError: a file is missing or no scene, no map, no PLY; the port is taken.
     """
     # viser and Mitsuba: not for --help
+    from tron.io.lights import LIGHT_SUFFIXES
+    from tron.scans.scan import Scan, is_of_capture
     from tron.shading.environments.environment import EnvironmentMap
     from tron.view.finding import MaterialSearch
     from tron.view.opening import files_of, finish_of, first_light, home_of
@@ -130,9 +130,14 @@ cli = command(
     "conf.view",
     Settings,
     main,
+    shown=(
+        *("scene", "environments", "light", "models", "output_dir", "host", "port", "ground"),
+        *("materials", "up"),
+    ),
     examples=(
         "tron-view scene=surfels.ply environments=hdris",
         "tron-view scene=scan.ply environments=studio.hdr models=things port=8090",
+        "tron-view scene=scan.ply environments=hdris materials=auto up=[0,0,1]",
     ),
     ended="what was saved is kept",
 )

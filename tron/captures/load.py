@@ -11,32 +11,20 @@ from typing import TYPE_CHECKING, Any, Literal
 
 from pydantic import ConfigDict, Field
 
-from tron.captures.assembly import assemble
-from tron.captures.capture import Capture
-from tron.captures.folder import is_capture_folder, load_traced
-from tron.captures.formats.colmap import model_folder, read_colmap
-from tron.captures.formats.metashape import cameras_file, read_metashape
-from tron.captures.formats.not_a_capture import refusal
-from tron.captures.formats.opensfm import read_opensfm, reconstruction_file
-from tron.captures.formats.polycam import camera_folder, read_polycam
-from tron.captures.formats.realitycapture import read_realitycapture, registration_file
-from tron.captures.formats.record3d import metadata_file, read_record3d
-from tron.captures.formats.scanner_app import is_scanner_app, read_scanner_app
-from tron.captures.formats.stray_scanner import is_stray_scanner, read_stray_scanner
-from tron.captures.formats.tensoir import TensoirSettings, is_tensoir, read_tensoir
-from tron.captures.formats.transforms import has_transforms, read_transforms
-from tron.captures.photos.photographs import PosedPhotos
-from tron.captures.photos.video_frames import FrameSettings
-from tron.captures.posing.structure_from_motion import (
+from tron.captures.settings import (
+    FrameSettings,
     MatchingSettings,
+    PhotoSettings,
     PosingSettings,
-    has_photos,
-    pose_photos,
+    TensoirSettings,
 )
-from tron.captures.posing.video import is_video, read_video
-from tron.captures.settings import PhotoSettings
 from tron.errors import TronError
 from tron.io.recognised import VIDEOS, foreign_poses, refuse_by_sight
+from tron.lazily import later
+
+if TYPE_CHECKING:
+    from tron.captures.capture import Capture
+    from tron.captures.photos.photographs import PosedPhotos
 
 log = logging.getLogger(__name__)
 
@@ -64,24 +52,46 @@ class CaptureFormat:
         return path.is_dir() or path.suffix.lower() in self.files
 
 
+def _format(holds: str, module: str, detect: str, read: str, files: tuple[str, ...] = ()) -> CaptureFormat:
+    """A row of functions of a module of this package, which is imported once one of them is called."""
+    return CaptureFormat(
+        holds, later(f"tron.captures.{module}", detect), later(f"tron.captures.{module}", read), files
+    )
+
+
 FORMATS = {
-    "tron": CaptureFormat("tron-datagen's views", is_capture_folder, load_traced, (".json",)),
-    "transforms": CaptureFormat(
-        "transforms.json of NeRF, instant-ngp, nerfstudio, DL3DV", has_transforms, read_transforms, (".json",)
+    "tron": _format("tron-datagen's views", "folder", "is_capture_folder", "load_traced", (".json",)),
+    "transforms": _format(
+        "transforms.json of NeRF, instant-ngp, nerfstudio, DL3DV",
+        *("formats.transforms", "has_transforms", "read_transforms", (".json",)),
     ),
-    "colmap": CaptureFormat("COLMAP's sparse/0", model_folder, read_colmap),
-    "tensoir": CaptureFormat("TensoIR's folders train_000, ...", is_tensoir, read_tensoir),
-    "polycam": CaptureFormat("Polycam's raw export", camera_folder, read_polycam),
-    "record3d": CaptureFormat("Record3D's EXR + RGB export", metadata_file, read_record3d),
-    "metashape": CaptureFormat("Metashape's XML of cameras", cameras_file, read_metashape, (".xml",)),
-    "opensfm": CaptureFormat("a project of OpenSfM or OpenDroneMap", reconstruction_file, read_opensfm),
-    "realitycapture": CaptureFormat(
-        "RealityCapture's CSV of cameras", registration_file, read_realitycapture, (".csv",)
+    "colmap": _format("COLMAP's sparse/0", "formats.colmap", "model_folder", "read_colmap"),
+    "tensoir": _format("TensoIR's folders train_000, ...", "formats.tensoir", "is_tensoir", "read_tensoir"),
+    "polycam": _format("Polycam's raw export", "formats.polycam", "camera_folder", "read_polycam"),
+    "record3d": _format("Record3D's EXR + RGB export", "formats.record3d", "metadata_file", "read_record3d"),
+    "metashape": _format(
+        "Metashape's XML of cameras", "formats.metashape", "cameras_file", "read_metashape", (".xml",)
     ),
-    "stray_scanner": CaptureFormat("Stray Scanner's recording", is_stray_scanner, read_stray_scanner),
-    "scanner_app": CaptureFormat("3D Scanner App's data", is_scanner_app, read_scanner_app),
-    "video": CaptureFormat("a video file, whose sharpest frames are posed", is_video, read_video, VIDEOS),
-    "photos": CaptureFormat("photos, posed by structure from motion", has_photos, pose_photos),
+    "opensfm": _format(
+        "a project of OpenSfM or OpenDroneMap", "formats.opensfm", "reconstruction_file", "read_opensfm"
+    ),
+    "realitycapture": _format(
+        "RealityCapture's CSV of cameras",
+        *("formats.realitycapture", "registration_file", "read_realitycapture", (".csv",)),
+    ),
+    "stray_scanner": _format(
+        "Stray Scanner's recording", "formats.stray_scanner", "is_stray_scanner", "read_stray_scanner"
+    ),
+    "scanner_app": _format(
+        "3D Scanner App's data", "formats.scanner_app", "is_scanner_app", "read_scanner_app"
+    ),
+    "video": _format(
+        "a video file, whose sharpest frames are posed", "posing.video", "is_video", "read_video", VIDEOS
+    ),
+    "photos": _format(
+        "photos, posed by structure from motion",
+        *("posing.structure_from_motion", "has_photos", "pose_photos"),
+    ),
 }
 """Formats by the names that ``format=`` takes, in the order in which ``auto`` looks for them."""
 
@@ -123,6 +133,12 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
         TronError: nothing there, no poses and no photos, poses without photos, fewer than two usable views,
             all views held out, files that cannot be read.
     """
+    from tron.captures.assembly import assemble
+    from tron.captures.capture import Capture
+    from tron.captures.formats.metashape import cameras_file
+    from tron.captures.formats.not_a_capture import refusal
+    from tron.captures.formats.realitycapture import registration_file
+
     path = Path(path)
     settings = settings or LoadSettings()
     if not path.exists():
@@ -141,6 +157,8 @@ def load_capture(path: str | os.PathLike[str], settings: LoadSettings | None = N
 
 
 def _detected(path: Path) -> str:
+    from tron.captures.formats.not_a_capture import refusal
+
     name = _format_of(path)
     if name is None:
         raise refusal(path, KINDS, _holds_capture)

@@ -1,4 +1,4 @@
-"""Settings of the photos of any capture."""
+"""Settings of how a capture is read; they wait for none of what reads it."""
 
 from __future__ import annotations
 
@@ -9,6 +9,11 @@ import numpy as np
 from pydantic import BaseModel, Field, field_validator
 
 from tron.captures.masks import MaskMeaning
+
+FEWEST = 3
+"""Photos that a video is made at least."""
+TRAIN_LIGHT = "sunset"
+"""Light of a TensoIR scene's training views."""
 
 
 class PhotoSettings(BaseModel):
@@ -78,3 +83,50 @@ class PhotoSettings(BaseModel):
         if self.downscale is None and self.max_side is not None:
             factor = max(1.0, max(width, height) / self.max_side)
         return max(1, round(width / factor)), max(1, round(height / factor))
+
+
+class FrameSettings(BaseModel):
+    """Frames of a video that become photos."""
+
+    frames: int = Field(
+        default=120, ge=FEWEST, description="photos made of a video: the sharpest of as many intervals"
+    )
+
+
+class MatchingSettings(BaseModel):
+    """Order of the photos, as the user knows it."""
+
+    matching: Literal["auto", "overlapping", "exhaustive", "sequential"] = Field(
+        default="auto",
+        description="how photos without poses are matched: overlapping compares each with the sixteen that "
+        "share most coarse features with it, exhaustive every pair, sequential each with the ten after it by "
+        "name; auto: sequential for videos, else overlapping",
+    )
+
+
+class PosingSettings(MatchingSettings, PhotoSettings):
+    """Structure from motion of photos without poses."""
+
+    workspace: Path | None = Field(
+        default=None, description="folder that keeps the poses; null: structure_from_motion beside the photos"
+    )
+    feature_side: int = Field(
+        default=1000, ge=64, description="features are sought in copies of at most so many pixels a side"
+    )
+    features: int = Field(
+        default=4096, ge=100, description="largest features that are kept of a photo, places in it"
+    )
+    threads: int = Field(
+        default=0,
+        ge=0,
+        description="threads; 0: all cores; 1 gives the same poses bit by bit, more nearly so",
+    )
+    seed: int = Field(default=0, description="root of the random samples that poses are estimated from")
+
+
+class TensoirSettings(BaseModel):
+    """Light of a TensoIR scene: its photos are ``rgba_{light}.png``, or ``rgba.png`` for that of training."""
+
+    tensoir_light: str = Field(
+        default=TRAIN_LIGHT, description="which light of a TensoIR scene is reconstructed"
+    )

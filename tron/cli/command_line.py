@@ -27,7 +27,7 @@ from omegaconf import OmegaConf
 
 import tron
 from tron import runtime
-from tron.cli.help_page import default_examples, render_help
+from tron.cli.help_page import HelpPage, default_examples
 from tron.cli.installation import loading, require_own_packages
 from tron.cli.log import LEVELS, configure_logging
 from tron.cli.recipes import check, complete, compose_recipe, group_options, resolve
@@ -59,6 +59,8 @@ class Command(Generic[Settings]):
     main: Callable[[Settings], int | None]
     examples: Sequence[str] = ()
     ended: str = KEPT
+    shown: Sequence[str] = ()
+    listed: str = ""
 
     def __call__(self, arguments: Sequence[str] | None = None) -> NoReturn:
         """Run on `arguments`, those of the process where None."""
@@ -75,8 +77,11 @@ class Command(Generic[Settings]):
         try:
             require_own_packages(self.config_module, self.settings.__module__)
             options = _parser(self.name).parse_intermixed_args(arguments)
-            if options.help:
-                print(self._help(options.overrides, options.config_dir), end="")
+            if "=" in (options.help or ""):  # --help key=value
+                options.overrides.append(options.help)
+                options.help = ""
+            if options.help is not None:
+                print(self._help(options.help, options.overrides, options.config_dir), end="")
                 return 0
             if options.version:
                 print(f"{self.name} {tron.__version__}")
@@ -109,13 +114,18 @@ class Command(Generic[Settings]):
             print(f"{self.name}: {verb}{_note(end) or kept}", file=sys.stderr)
             return code
 
-    def _help(self, overrides: Sequence[str], config_dir: Path | None) -> str:
+    def _help(self, topic: str, overrides: Sequence[str], config_dir: Path | None) -> str:
         groups = group_options(self.config_module, config_dir)
-        recipe = complete(compose_recipe(self.config_module, self.settings, overrides, config_dir))
+        recipe = compose_recipe(self.config_module, self.settings, overrides, config_dir)
+        if topic:  # the short page waits for no class that a recipe names
+            recipe = complete(recipe)
         defaults: Any = OmegaConf.to_container(recipe, resolve=False)
         purpose = inspect.getdoc(self.main) or self.settings.__doc__ or self.name
         examples = self.examples or default_examples(self.name, groups)
-        return render_help(self.name, purpose, self.settings, defaults, groups, examples)
+        page = HelpPage(
+            self.name, purpose, self.settings, defaults, groups, examples, self.shown, self.listed
+        )
+        return page.short() if not topic else page.whole() if topic == "all" else page.about(topic)
 
 
 def command(
@@ -125,18 +135,22 @@ def command(
     main: Callable[[Settings], int | None],
     examples: Sequence[str] = (),
     ended: str = KEPT,
+    shown: Sequence[str] = (),
+    listed: str = "",
 ) -> Command[Settings]:
     """Make a console entry point.
 
     Args:
         name: the command as typed, such as `tron-datagen`; every error line starts with it.
         config_module: importable package with `config.yaml` and groups beside it, such as `conf.datagen`.
-        settings: pydantic model of the whole configuration, `extra="forbid"`; its descriptions make `--help`.
+        settings: pydantic model of the whole configuration, `extra="forbid"`; help tells its descriptions.
         main: does the work; its docstring is what `--help` says the command does. It may return an exit code.
-        examples: command lines for `--help`.
+        examples: command lines for `--help all`; the first three are those of `--help`.
         ended: what is left after an interruption, said behind it; "": nothing.
+        shown: the keys that people set most, at most ten; `--help` shows these.
+        listed: group of recipes whose options `--help` tells one by one.
     """
-    return Command(name, config_module, settings, main, examples, ended)
+    return Command(name, config_module, settings, main, examples, ended, shown, listed)
 
 
 def _note(end: BaseException) -> str:
@@ -166,7 +180,7 @@ class _Arguments(argparse.ArgumentParser):
 def _parser(name: str) -> argparse.ArgumentParser:
     parser = _Arguments(prog=name, add_help=False, allow_abbrev=False)
     parser.add_argument("overrides", nargs="*")
-    parser.add_argument("-h", "--help", action="store_true")
+    parser.add_argument("-h", "--help", nargs="?", const="")
     parser.add_argument("--version", action="store_true")
     parser.add_argument("--cfg", choices=["job"])
     parser.add_argument("--log-level", choices=LEVELS)

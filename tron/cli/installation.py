@@ -22,8 +22,6 @@ from pathlib import Path
 from types import FunctionType, ModuleType
 from typing import Any, NoReturn
 
-from packaging.requirements import Requirement
-
 import tron
 from tron.errors import TronError
 from tron.termination import termination_noted
@@ -105,6 +103,8 @@ def missing_libraries(extra: str) -> list[str]:
 
 def _libraries(extra: str) -> Iterator[str]:
     """Names of the distributions that an extra adds to the base, those of the extras it includes too."""
+    from packaging.requirements import Requirement
+
     try:
         requirements = importlib.metadata.requires(DISTRIBUTION) or []
     except importlib.metadata.PackageNotFoundError:  # run from a checkout that was never installed
@@ -133,7 +133,7 @@ class ConsoleScript:
     Attributes:
         name: as typed.
         module: holds the command as `cli`.
-        named: what its recipes name by `_target_` and the module does not import by itself.
+        named: what its recipes name by `_target_`, and registries of words, which the module does not import.
         of_extra: the extra that it needs; None: that of its name, `train` for `tron-train`.
     """
 
@@ -152,7 +152,7 @@ class ConsoleScript:
         asked = sys.argv[1:] if arguments is None else arguments
         try:
             require_own_packages("conf", self.module)
-            if {"-h", "--help"} & set(asked):
+            if any(each in ("-h", "--help") or each.startswith("--help=") for each in asked):
                 absent = missing_libraries(extra)
                 known = f"{DISTRIBUTION}[{extra}]"
                 needs = f"needs pip install '{known}'; not installed here: {', '.join(absent)}"
@@ -176,14 +176,18 @@ class ConsoleScript:
             signal.signal(signal.SIGINT, signal.SIG_IGN)
 
 
-relight = ConsoleScript("tron-relight", "tron.apps.relight.command")
+relight = ConsoleScript("tron-relight", "tron.apps.relight.cli")
 edit = ConsoleScript("tron-edit", "tron.apps.edit", of_extra="relight")
 bake = ConsoleScript("tron-bake", "tron.apps.bake", of_extra="relight")
 environment = ConsoleScript("tron-environment", "tron.apps.environment", of_extra="relight")
 export = ConsoleScript("tron-export", "tron.apps.export", of_extra="relight")
 view = ConsoleScript("tron-view", "tron.apps.view")
-reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.command", ("tron.reconstruction",))
-datagen = ConsoleScript("tron-datagen", "datagen.cli")
+reconstruct = ConsoleScript("tron-reconstruct", "tron.apps.reconstruct.cli", ("tron.reconstruction.priors",))
+datagen = ConsoleScript(
+    "tron-datagen",
+    "datagen.cli",
+    ("tron.reconstruction.priors", "datagen.world.scene"),
+)
 train = ConsoleScript("tron-train", "train.cli")
 evaluate = ConsoleScript("tron-eval", "eval.cli")
 

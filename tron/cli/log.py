@@ -7,9 +7,6 @@ import os
 import sys
 from typing import Literal, get_args
 
-from rich.console import Console
-from rich.logging import RichHandler
-
 Level = Literal["debug", "info", "warning", "error"]
 LEVELS: tuple[Level, ...] = get_args(Level)
 VARIABLE = "TRON_LOG_LEVEL"
@@ -28,6 +25,9 @@ def configure_logging(level: Level | None = None) -> None:
         os.environ[VARIABLE] = level
     level = log_level()
     if sys.stderr.isatty():
+        from rich.console import Console
+        from rich.logging import RichHandler
+
         handler: logging.Handler = RichHandler(console=Console(stderr=True), show_path=False)
         handler.setFormatter(logging.Formatter("%(message)s", datefmt="%X"))
     else:

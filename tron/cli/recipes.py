@@ -23,7 +23,6 @@ from hydra.core.global_hydra import GlobalHydra
 from hydra.core.override_parser.overrides_parser import OverridesParser
 from hydra.core.override_parser.types import Override
 from hydra.errors import HydraException
-from hydra.utils import get_object
 from omegaconf import DictConfig, OmegaConf
 from omegaconf.errors import OmegaConfBaseException
 from pydantic_core import to_jsonable_python
@@ -83,8 +82,8 @@ def compose_recipe(
             recipe = DictConfig(values)
             keys = [_setting(text, settings, values) for text in overrides if text not in chosen]
             changed = {each.key_or_group for each in keys if not each.is_add() and not each.is_force_add()}
-            if not changed <= _keys(recipe):
-                recipe = complete(recipe)
+            if any(_in_target(values, key) for key in changed - _keys(recipe)):
+                recipe = complete(recipe)  # imports what it names
             for key in sorted(changed - _keys(recipe)):
                 raise unknown_key(key, [*_keys(recipe), *groups])
             for each in keys:
@@ -134,6 +133,8 @@ def _merged(under: Any, over: Any) -> Any:
 
 
 def _target_defaults(target: str) -> dict[str, Any]:
+    from hydra.utils import get_object
+
     try:
         made = get_object(target)
     except Exception:  # whatever importing it raises: it is told when the object is made
@@ -147,6 +148,15 @@ def _target_defaults(target: str) -> dict[str, Any]:
 
 def _keys(recipe: DictConfig) -> set[str]:
     return {key for key, _ in nested_items(OmegaConf.to_container(recipe))}
+
+
+def _in_target(values: Any, key: str) -> bool:
+    """Whether a key that the values do not have may be one of a class that they name by ``_target_``."""
+    for part in key.split(".")[:-1]:
+        values = values.get(part) if isinstance(values, Mapping) else None
+        if isinstance(values, Mapping) and "_target_" in values:
+            return True
+    return False
 
 
 def complete(recipe: DictConfig) -> DictConfig:
@@ -199,7 +209,8 @@ def group_options(config_module: str, config_dir: Path | None = None) -> dict[st
     root = resources.files(config_module)
     with _loader(config_module) as loader:
         options = {group: _options(loader, group, config_dir) for group in _groups(loader)}
-        chosen = compose("config", return_hydra_config=True).hydra.runtime.choices
+    listed = yaml.safe_load(root.joinpath("config.yaml").read_text("utf-8")).get("defaults", ())
+    chosen = {group: name for each in listed if isinstance(each, dict) for group, name in each.items()}
 
     def describe(group: str, name: str) -> str:
         path = root.joinpath(group, f"{name}.yaml")
@@ -231,11 +242,11 @@ def unknown_key(key: str, known: Sequence[str], beside: Sequence[str] = ()) -> T
 
     Args:
         key: dotted.
-        known: keys that --help lists.
-        beside: names that could stand in its place, where --help does not list them.
+        known: keys that --help all lists.
+        beside: names that could stand in its place, where --help all does not list them.
     """
     if not beside:
-        return TronError(f"unknown key '{key}'", mend=f"{did_you_mean(key, known)}--help lists every key")
+        return TronError(f"unknown key '{key}'", mend=f"{did_you_mean(key, known)}--help all lists every key")
     near = did_you_mean(key, [f"{key.rpartition('.')[0]}.{name}" for name in beside])
     return TronError(f"unknown key '{key}'", mend=f"{near}there are {', '.join(beside)}")
 
@@ -501,6 +512,8 @@ def _member(annotation: Any, node: Any, part: str) -> Any:
 
 def _parameter(target: str, name: str) -> Any:
     """Annotation of a field or parameter of what ``_target_`` names; None where it has none."""
+    from hydra.utils import get_object
+
     try:
         return get_type_hints(get_object(target)).get(name)
     except Exception:  # whatever importing it raises: it is told when the object is made

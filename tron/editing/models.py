@@ -9,17 +9,14 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 from pydantic import Field, model_validator
-from scipy.spatial.transform import Rotation
 
-from tron.editing.placement import surface_below
 from tron.editing.selections import Part, Vector
-from tron.editing.views import Views
 from tron.errors import TronError
 from tron.framing import find_subject, upright
-from tron.gaussians.scene import GaussianScene
 from tron.termination import termination_noted
 
 if TYPE_CHECKING:
+    from tron.gaussians.scene import GaussianScene
     from tron.models.parts import Part as MeshPart
 
 log = logging.getLogger(__name__)
@@ -83,6 +80,8 @@ class PlacedModel(Part):
         Raises:
             TronError: nothing lies below, or its size and the scene's cannot be meant.
         """
+        from scipy.spatial.transform import Rotation
+
         corners = np.concatenate([part.vertices for part in parts])
         low, high = corners.min(axis=0), corners.max(axis=0)
         scale = self.scale if self.height is None else self.height / max(high[2] - low[2], 1e-300)
@@ -110,6 +109,9 @@ class PlacedModel(Part):
     def _stood(self, scene: GaussianScene, at: np.ndarray, ground: float | None) -> np.ndarray:
         if not self.standing:
             return at
+        from tron.editing.placement import surface_below
+        from tron.editing.views import Views
+
         try:
             return surface_below(scene, Views(), at)
         except TronError as error:

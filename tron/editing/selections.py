@@ -7,17 +7,17 @@ object 3. ``any`` joins selections, ``but_not`` takes one away.
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Any
+from typing import TYPE_CHECKING, Annotated, Any
 
 import numpy as np
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from tron.color import luminance
-from tron.editing.colors import hues
-from tron.editing.regions import grown, parted
-from tron.editing.views import Views
 from tron.errors import TronError
-from tron.gaussians.scene import GaussianScene
+
+if TYPE_CHECKING:
+    from tron.editing.views import Views
+    from tron.gaussians.scene import GaussianScene
 
 Vector = tuple[float, float, float]
 
@@ -95,6 +95,8 @@ class MaterialRange(Part):
 
     def of(self, scene: GaussianScene) -> np.ndarray:
         """(M,) bool."""
+        from tron.editing.colors import hues
+
         within = np.ones(len(scene), bool)
         channels = {
             "roughness": scene.roughness,
@@ -129,6 +131,8 @@ class Grown(Part):
 
     def of(self, scene: GaussianScene, views: Views) -> np.ndarray:
         """(M,) bool."""
+        from tron.editing.regions import grown
+
         return grown(scene, _surfels(scene, views, self.view, self.at), self.angle, self.color)
 
 
@@ -218,6 +222,8 @@ class Selection(Part):
             TronError: an object that the scene does not have, a view or a pixel that is not there. That
                 nothing is selected is no error here.
         """
+        from tron.editing.views import Views
+
         views = Views() if views is None else views
         selected = np.ones(len(scene), bool)
         if self.object is not None:
@@ -256,6 +262,8 @@ def _parted(scene: GaussianScene, views: Views, clicks: Clicks | tuple[Clicks, .
         np.concatenate([_surfels(scene, views, each.view, getattr(each, side)) for each in every])
         for side in ("inside", "outside")
     )
+    from tron.editing.regions import parted
+
     return parted(scene, inside, outside)
 
 

@@ -5,10 +5,12 @@ Columns are centred on half texels and wrap around; rows stand on the poles.
 
 from __future__ import annotations
 
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
-from scipy import sparse
+
+if TYPE_CHECKING:
+    from scipy import sparse
 
 
 def row_integrals(height: int, density: Any) -> np.ndarray:
@@ -73,6 +75,8 @@ def _average(edges: np.ndarray, size: int, offset: float, density: Any) -> spars
             value.append(share)
     shape = (len(lower), size)
     entries = np.concatenate(value), (np.concatenate(row), np.concatenate(column))
+    from scipy import sparse
+
     matrix = sparse.coo_matrix(entries, shape).tocsr()
     return sparse.diags(1 / np.asarray(matrix.sum(1)).ravel()) @ matrix
 

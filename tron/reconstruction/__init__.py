@@ -1,9 +1,10 @@
 """From captures to relightable scenes: surfels (stage 1), materials (stage 2) and light (stage 3)."""
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-if TYPE_CHECKING:  # torch, which a scan's materials are found without
+from tron.lazily import lazily
+
+if TYPE_CHECKING:
     from tron.reconstruction.light.fit_environment import EnvironmentFit, fit_environment
     from tron.reconstruction.pipeline import Reconstruction, reconstruct
     from tron.reconstruction.priors import GroundTruth, Joint, MapPrior, Precomputed, Prior, RgbX
@@ -24,15 +25,12 @@ __all__ = [
     "reconstruct",
 ]
 
-_HOMES = {
-    **dict.fromkeys(("EnvironmentFit", "fit_environment"), "light.fit_environment"),
-    **dict.fromkeys(("Reconstruction", "reconstruct"), "pipeline"),
-    **dict.fromkeys(("GroundTruth", "Joint", "MapPrior", "Precomputed", "Prior", "RgbX"), "priors"),
-    **dict.fromkeys(("FitSettings", "ReconstructionSettings"), "settings"),
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "light.fit_environment": "EnvironmentFit fit_environment",
+        "pipeline": "Reconstruction reconstruct",
+        "priors": "GroundTruth Joint MapPrior Precomputed Prior RgbX",
+        "settings": "FitSettings ReconstructionSettings",
+    },
+)

@@ -26,9 +26,10 @@ from tron.gaussians.edit import subset
 from tron.gaussians.kept import KeptFiles
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate
+from tron.scans import GroundChoice, Treatment
 from tron.scans.camera_files import filmed_orbit, filmed_with
 from tron.scans.materials import put_on, with_materials
-from tron.scans.surroundings import Surrounded, Treatment, treat_surroundings
+from tron.scans.surroundings import Surrounded, treat_surroundings
 from tron.seeds import integer
 from tron.trajectories import TrajectoryName, plan_cameras
 
@@ -44,7 +45,6 @@ LIGHT = "environment.exr"
 """File name of the light of a capture: tron-reconstruct writes it beside the scene, in the scene's frame."""
 APART = Path("outputs")
 """Folder for files derived from a scan whose own folder is read-only."""
-GroundChoice = Literal["auto", "none"] | float
 Materials = Literal["auto", "kept", "as_is"]
 
 

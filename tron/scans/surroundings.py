@@ -5,16 +5,15 @@ from __future__ import annotations
 import logging
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Literal
 
 import numpy as np
 
 from tron.gaussians.edit import subset
 from tron.gaussians.scene import GaussianScene
+from tron.scans import Treatment
 
 log = logging.getLogger(__name__)
 
-Treatment = Literal["drop", "background", "keep"]
 _SAYS = {
     "drop": "they are left out; %(key)s=background shows them behind the scene, %(key)s=keep keeps them in "
     "the light's way",

@@ -5,15 +5,15 @@ them, `reader` opens them again without ever unpickling anything, `clip_store` r
 the `index` of a shard, `webdataset` gives them as a pipeline of tensors, `verify` finds damage.
 """
 
-from importlib import import_module
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
-from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
+from tron.lazily import lazily
 
-if TYPE_CHECKING:  # tron-relight knows the members and reads no clip; who reads clips may lack webdataset
+if TYPE_CHECKING:
     from tron.shards.clip_store import ClipStore
     from tron.shards.manifest import Manifest, ShardEntry
     from tron.shards.reader import read_clips, verify
+    from tron.shards.schema import GUIDANCE, MEMBERS, SCHEMA_VERSION, Clip, ClipMeta, clip_members
     from tron.shards.streaming import webdataset
     from tron.shards.writer import ShardWriter
 
@@ -33,16 +33,14 @@ __all__ = [
     "webdataset",
 ]
 
-_HOMES = {
-    "ClipStore": "clip_store",
-    **dict.fromkeys(("Manifest", "ShardEntry"), "manifest"),
-    **dict.fromkeys(("read_clips", "verify"), "reader"),
-    "webdataset": "streaming",
-    "ShardWriter": "writer",
-}
-
-
-def __getattr__(name: str) -> Any:
-    if name not in _HOMES:
-        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
-    return getattr(import_module(f"{__name__}.{_HOMES[name]}"), name)
+__getattr__ = lazily(
+    __name__,
+    {
+        "clip_store": "ClipStore",
+        "manifest": "Manifest ShardEntry",
+        "writer": "ShardWriter",
+        "reader": "read_clips verify",
+        "streaming": "webdataset",
+        "schema": "GUIDANCE MEMBERS SCHEMA_VERSION Clip ClipMeta clip_members",
+    },
+)

@@ -13,7 +13,6 @@ from typing import IO, Annotated
 from urllib.error import URLError
 from urllib.request import Request, urlopen
 
-from fsspec.core import url_to_fs
 from pydantic import BeforeValidator
 
 from tron.errors import TronError
@@ -147,6 +146,8 @@ class DatasetFolder:
             raise TronError("a pipe is no dataset folder", str(place), "only tron-train reads pipes")
         self.place = str(place)
         self.local = None if is_url(place) else Path(place)
+        from fsspec.core import url_to_fs
+
         try:
             self._files, self._root = url_to_fs(self.place)
         except (ImportError, ValueError) as error:

@@ -20,7 +20,8 @@ from typing import Any
 
 from tron.gaussians.scene import GaussianScene
 from tron.runtime import activate
-from tron.scans.scan import GroundChoice, Scan
+from tron.scans import GroundChoice
+from tron.scans.scan import Scan
 
 LEAST_PRIORITY = 19
 """Niceness of the search: pictures come first."""

@@ -176,7 +176,7 @@ def test_a_scene_that_fails_on_a_worker_leaves_its_traceback_and_the_workers_log
 
 def test_help_lists_the_keys_of_the_chosen_kind(capsys):
     with pytest.raises(SystemExit):
-        cli(["cluster=slurm", "--help"])
+        cli(["cluster=slurm", "--help", "all"])
     page = capsys.readouterr().out
     for key in ("queue", "account", "walltime", "cores", "memory", "interface", "job_extra_directives"):
         assert f"cluster.{key}=" in page

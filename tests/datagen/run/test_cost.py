@@ -117,7 +117,7 @@ def test_a_scene_may_take_twenty_times_its_cost(small_settings, tmp_path: Path):
 
 def test_help_teaches_the_plan(capsys):
     with pytest.raises(SystemExit):
-        cli(["--help"])
+        cli(["--help", "all"])
     text = capsys.readouterr().out
     assert "mode=plan" in text
     assert "variety_against" in text

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from tron.apps.relight.command import cli
+from tron.apps.relight.cli import cli
 from tron.gaussians.harmonics import rgb_to_dc
 from tron.gaussians.scene import GaussianScene, quats_from_normals
 from tron.shading.environments.environment import EnvironmentMap

@@ -35,7 +35,7 @@ def lights(tmp_path_factory) -> list[Path]:
 @pytest.fixture(scope="module")
 def over(variant, scene_path, lights, tmp_path_factory):
     """One frame over each background: name -> folder of pictures."""
-    from tron.apps.relight.command import cli
+    from tron.apps.relight.cli import cli
 
     base = tmp_path_factory.mktemp("over")
     for name, background in BACKGROUNDS.items():

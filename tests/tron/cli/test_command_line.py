@@ -239,7 +239,7 @@ def test_cfg_prints_yaml_that_holds_every_override(run: Run):
 
 def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monkeypatch):
     monkeypatch.setenv("COLUMNS", "72")
-    code, out, err = run("--help")
+    code, out, err = run("--help", "all")
     assert (code, err) == (0, "")
     for text in (
         "Take a toy picture.",
@@ -263,8 +263,21 @@ def test_help_teaches_purpose_keys_defaults_recipes_and_examples(run: Run, monke
     ):
         assert text in out
     assert "_target_" not in out
-    assert "lens.fov_deg=20 " in run("lens=tele", "--help")[1], "the keys of the option that is asked about"
+    page = run("lens=tele", "--help", "all")[1]
+    assert "lens.fov_deg=20 " in page, "the keys of the option that is asked about"
     assert max(map(len, out.splitlines())) <= 72
+
+
+def test_help_of_one_name_tells_that_alone(run: Run):
+    assert run("--help", "frames") == (0, "  frames=3   [integer]\n      Number of frames.\n", "")
+    code, out, _ = run("--help=lens", "lens=tele")
+    assert (code, out.splitlines()[0]) == (0, "  lens.fov_deg=20   [number]")
+    assert "lens=NAME\n  tele\n  wide" in out
+    assert "cluster.workers=4" in run("--help", "cluster.workers")[1]
+    assert run("--help", "framez")[::2] == (
+        2,
+        "tron-toy: no setting 'framez': did you mean 'frames'? --help all lists every setting\n",
+    )
 
 
 def test_an_error_of_the_work_is_one_line_too(run: Run):

@@ -46,7 +46,7 @@ pages = {}
 for command in ("relight", "edit", "bake", "view", "reconstruct", "datagen", "train", "evaluate"):
     out = io.StringIO()
     with contextlib.redirect_stdout(out), contextlib.suppress(SystemExit):
-        getattr(installation, command)(["--help"])
+        getattr(installation, command)(["--help", "all"])
     pages[command] = out.getvalue()
 print(json.dumps(pages))
 """

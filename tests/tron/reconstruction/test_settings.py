@@ -7,7 +7,7 @@ from typing import Any
 import pytest
 from pydantic import ValidationError
 
-from tron.apps.reconstruct.command import Settings
+from tron.apps.reconstruct.cli import Settings
 from tron.cli.recipes import check, compose_recipe
 from tron.reconstruction.settings import (
     DensitySettings,

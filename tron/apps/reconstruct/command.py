@@ -10,7 +10,6 @@ import tron
 from tron.apps.reconstruct.settings import Settings
 from tron.apps.reconstruct.splat_capture import film_splats, is_splats
 from tron.captures import Capture, load_capture
-from tron.cli.command_line import command
 from tron.cli.instantiation import make
 from tron.cli.progress import track, working
 from tron.errors import TronError
@@ -32,15 +31,8 @@ RESULTS = (
 SURFEL_BYTES = 1600  # PLY, checkpoint with Adam's moments, and their temporary copies
 
 
-def main(settings: Settings) -> None:
-    """Turn posed photos, bare photos, path-traced views or splats into surfels with materials and a light.
-
-    Writes scene.ply, which tron-relight and every 3DGS viewer open, environment.exr, metrics.json (held-out
-    and training views), report.html (the scene relit, its G-buffers, its light, how sure each figure is),
-    contact_sheet.png (held-out views and every channel), light.png, cameras.json (where the photos
-    were taken, for tron-relight) and config.yaml. A run that was interrupted resumes when it is started
-    again.
-    """
+def run(settings: Settings) -> None:
+    """Do what the command does; its ``main`` says what that is."""
     with working("reading the capture"):
         prior = make(settings.prior, "prior")
         lpips = _load_lpips(settings)
@@ -134,21 +126,3 @@ def _log_summary(report: dict[str, Any], out: Path) -> None:
     log.info("%d surfels in %s", report["surfels"], out / "scene.ply")
     pages = [out / name for name in ("report.html", "contact_sheet.png") if (out / name).is_file()]
     log.info("look at %s", pages[0])
-
-
-cli = command(
-    "tron-reconstruct",
-    "conf.reconstruct",
-    Settings,
-    main,
-    examples=(
-        "tron-reconstruct capture=photos output_dir=outputs/mine",
-        "tron-reconstruct experiment=photos capture=fox output_dir=outputs/fox",
-        "tron-reconstruct capture=scene prior=ground_truth initial.source=depth output_dir=out",
-        "tron-reconstruct capture=scan.ply output_dir=outputs/relightable",
-        "tron-reconstruct capture=garden prior=precomputed prior.folder=maps experiment=paper output_dir=out",
-    ),
-)
-
-if __name__ == "__main__":
-    cli()

@@ -3,15 +3,15 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from pydantic import BaseModel, ConfigDict, Field
 
-from tron.apps.reconstruct.splat_capture import SplatSettings
-from tron.captures import LoadSettings
-from tron.captures.load import CaptureSettings
+from tron.apps.scene_file import SURROUNDINGS
+from tron.captures.load import CaptureSettings, LoadSettings
 from tron.reconstruction.settings import FitSettings, ReconstructionSettings
 from tron.runtime import Variant
+from tron.scans import Treatment
 
 
 class Paths(BaseModel):
@@ -21,6 +21,27 @@ class Paths(BaseModel):
         description="folder of photos, with or without poses, or of path-traced views; or a PLY of splats"
     )
     output_dir: Path = Field(description="folder for scene.ply, environment.exr, metrics.json and pictures")
+
+
+class SplatSettings(BaseModel):
+    """Virtual cameras that film a file of splats."""
+
+    model_config = ConfigDict(frozen=True, extra="forbid")
+
+    geometry: Literal["auto", "scan", "new"] = Field(
+        default="auto",
+        description="scan: all of its surfels stay as they are and get materials, in a minute; new: other "
+        "surfels are learnt from the film, which takes many minutes and loses detail, but gives them "
+        "normals; auto: new where the scan is thin, else scan",
+    )
+    cameras: Literal["auto", "around", "inside", "both"] = Field(
+        default="auto",
+        description="around the subject, for things; inside, for rooms: from free places, in all directions; "
+        "both: half of each; auto: as in cameras.json beside the file, where photos looked, else around",
+    )
+    views: int = Field(default=64, ge=4, le=10_000, description="number of pictures")
+    surroundings: Treatment = Field(default="drop", description=SURROUNDINGS)
+    side: int = Field(default=200, ge=16, le=8192, description="their width and height, pixels")
 
 
 class ReportSettings(BaseModel):

@@ -12,13 +12,11 @@ import logging
 from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Literal
+from typing import TYPE_CHECKING
 
 import numpy as np
-from pydantic import BaseModel, ConfigDict, Field
 from scipy.spatial import KDTree
 
-from tron.apps.scene_file import SURROUNDINGS
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.errors import TronError
@@ -26,11 +24,11 @@ from tron.gaussians.formats.registry import check_header, named_as_splats, refus
 from tron.gaussians.scene import GaussianScene
 from tron.scans import Scan
 from tron.scans.camera_files import CAMERAS
-from tron.scans.surroundings import Treatment
 from tron.seeds import generator
 from tron.trajectories import film_around, film_with
 
 if TYPE_CHECKING:
+    from tron.apps.reconstruct.settings import SplatSettings
     from tron.reconstruction.progress import Track
     from tron.reconstruction.settings import FusionSettings
 
@@ -48,27 +46,6 @@ SOLID = 0.5
 KEPT = 0.3
 """Share of thick pixels up to which surfels learnt anew were better on scans of development (17 and 23 %); of
 thick ones (58 and 59 %) either was, and detail of large scans is the scan's own."""
-
-
-class SplatSettings(BaseModel):
-    """Virtual cameras that film a file of splats."""
-
-    model_config = ConfigDict(frozen=True, extra="forbid")
-
-    geometry: Literal["auto", "scan", "new"] = Field(
-        default="auto",
-        description="scan: all of its surfels stay as they are and get materials, in a minute; new: other "
-        "surfels are learnt from the film, which takes many minutes and loses detail, but gives them "
-        "normals; auto: new where the scan is thin, else scan",
-    )
-    cameras: Literal["auto", "around", "inside", "both"] = Field(
-        default="auto",
-        description="around the subject, for things; inside, for rooms: from free places, in all directions; "
-        "both: half of each; auto: as in cameras.json beside the file, where photos looked, else around",
-    )
-    views: int = Field(default=64, ge=4, le=10_000, description="number of pictures")
-    surroundings: Treatment = Field(default="drop", description=SURROUNDINGS)
-    side: int = Field(default=200, ge=16, le=8192, description="their width and height, pixels")
 
 
 def is_splats(path: Path) -> bool:

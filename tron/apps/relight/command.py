@@ -21,7 +21,6 @@ from tron.apps.relight.network import averaged_frames_of, chosen_network, descri
 from tron.apps.relight.settings import Settings
 from tron.apps.scene_file import require_file
 from tron.cameras import Camera
-from tron.cli.command_line import command
 from tron.cli.progress import track, working
 from tron.denoising import require
 from tron.editing.models import foot_of, read_model
@@ -48,15 +47,8 @@ if TYPE_CHECKING:
 log = logging.getLogger(__name__)
 
 
-def main(settings: Settings) -> None:
-    """Light a Gaussian scene with environment maps and film it along a camera path.
-
-    Writes frames/NNNN.relit.png, relit.mp4 (the neural renderer's pictures where there is a checkpoint,
-    otherwise shadows, reflections and the light that bounces between the surfels), what they are made of as
-    frames/NNNN.{pbr,irradiance,...}.exr (linear) and .png (AgX), guidance.mp4, contact_sheet.png and
-    relight.json; with a checkpoint also NNNN.neural.png and neural.mp4. An interrupted run resumes when it is
-    started again.
-    """
+def run(settings: Settings) -> None:
+    """Do what the command does; its ``main`` says what that is."""
     clock = _Clock()
     given = _read(settings)
     settings, lights = given.settings, given.settings.by_light()
@@ -222,26 +214,3 @@ class _Clock:
     def lap(self, name: str) -> None:
         now = time.perf_counter()
         self.laps[name], self.last = round(now - self.last, 3), now
-
-
-cli = command(
-    "tron-relight",
-    "conf.relight",
-    Settings,
-    main,
-    examples=(
-        "tron-relight scene=surfels.ply environment=studio.hdr output_dir=outputs/relit",
-        "tron-relight scene=surfels.ply environment=studio.hdr quality=final reflections=16 output_dir=out",
-        "tron-relight scene=scan.ply environment=[dawn.hdr,night.hdr] output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr trajectory=still rotation=[0,360] output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr 'meshes=[{file: cow.glb, at: [0,0,1]}]' "
-        "output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr background=transparent output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=renderer.safetensors output_dir=out",
-        "tron-relight scene=surfels.ply environment=a.hdr checkpoint=paper overlap=newest "
-        "'weights={pbr: 0.3, irradiance: 0.7}' output_dir=out",
-    ),
-)
-
-if __name__ == "__main__":
-    cli()

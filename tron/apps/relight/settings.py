@@ -5,7 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, Literal, TypeVar
 
-import numpy as np
 from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
 
 import tron
@@ -15,17 +14,13 @@ from tron.apps.splat_file import SceneFile
 from tron.color import Look
 from tron.denoising import DENOISERS, DenoiserName
 from tron.editing.models import PlacedModel
-from tron.editing.motion import Motion
 from tron.errors import TronError
 from tron.estimation import FINAL, QUALITY, Brdf, Estimation, Estimator, require_bounces
-from tron.io.cameras.registry import cameras_of
 from tron.neural.clips import Overlap
 from tron.neural.configs import check_sizes
 from tron.neural.shipped import AUTO, DEFAULT, SHIPPED
 from tron.runtime import Variant
-from tron.scans.camera_files import CAMERAS, frame_size
-from tron.scans.scan import LIGHT, GroundChoice, is_of_capture
-from tron.scans.surroundings import Treatment
+from tron.scans import GroundChoice, Treatment
 from tron.shards.schema import guidance_members, light_members
 from tron.storage import sha256
 from tron.trajectories import TrajectoryName
@@ -37,6 +32,8 @@ BUFFERS = (
     "relit",
 )
 if TYPE_CHECKING:
+    import numpy as np
+
     BufferName = str
 else:
     BufferName = Literal[BUFFERS]
@@ -231,6 +228,8 @@ class Settings(BaseModel):
     def _finds_its_own_light(cls, data: Any) -> Any:
         if not isinstance(data, dict) or not isinstance(data.get("scene"), str | Path):
             return data
+        from tron.scans.scan import LIGHT
+
         own, given = str(Path(data["scene"]).with_name(LIGHT)), data.get("environment")
         several = isinstance(given, list | tuple)
         found = [own if str(each) == "capture" else each for each in (given if several else [given])]
@@ -284,6 +283,10 @@ class Settings(BaseModel):
             frames: their number.
             up: (3,) unit, in the frame of the scene's file.
         """
+        from tron.editing.motion import Motion
+        from tron.scans.camera_files import CAMERAS
+        from tron.scans.scan import is_of_capture
+
         counted = {
             name for name, field in type(self).model_fields.items()
             if not (isinstance(extra := field.json_schema_extra, dict) and extra.get("display_only"))
@@ -357,6 +360,9 @@ class Settings(BaseModel):
 
     def shaped(self) -> Settings:
         """The settings with the size and the field of view of frames, as the photos have them where known."""
+        from tron.io.cameras.registry import cameras_of
+        from tron.scans.camera_files import CAMERAS, frame_size
+
         path = self.cameras or self.scene.with_name(CAMERAS)
         shape, fov = (LONGER_SIDE, LONGER_SIDE), 40.0
         if path.is_file():

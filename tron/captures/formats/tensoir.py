@@ -11,26 +11,17 @@ import re
 from pathlib import Path
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from tron.cameras import opengl_to_opencv, rigid_pose
 from tron.captures.photos.image_folder import relative_parts
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
+from tron.captures.settings import TRAIN_LIGHT, TensoirSettings
 from tron.errors import TronError
 from tron.io.transforms_json import read_json
 from tron.lenses import Lens, opencv_lens
 
-TRAIN_LIGHT = "sunset"
 _CURVE = 2.2
 _FOLDER = re.compile(r"(train|test)_\d+")
-
-
-class TensoirSettings(BaseModel):
-    """Light of a TensoIR scene: its photos are ``rgba_{light}.png``, or ``rgba.png`` for that of training."""
-
-    tensoir_light: str = Field(
-        default=TRAIN_LIGHT, description="which light of a TensoIR scene is reconstructed"
-    )
 
 
 def is_tensoir(path: Path) -> bool:

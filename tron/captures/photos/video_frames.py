@@ -8,7 +8,6 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from pydantic import BaseModel, Field
 
 from tron.io.images import encode_jpeg
 from tron.io.video import Frame
@@ -16,18 +15,9 @@ from tron.storage import atomic_folder
 
 FRAMES = "frames"
 """Folder of the frames in a workspace."""
-FEWEST = 3
 WIDTH = 480
 """Columns that frames are reduced to where they are judged."""
 _RECORD = "video.json"
-
-
-class FrameSettings(BaseModel):
-    """Frames of a video that become photos."""
-
-    frames: int = Field(
-        default=120, ge=FEWEST, description="photos made of a video: the sharpest of as many intervals"
-    )
 
 
 def sharpest(

@@ -18,11 +18,10 @@ import shutil
 from collections.abc import Collection, Mapping, Sequence
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, Literal
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 from PIL import Image, ImageOps
-from pydantic import BaseModel, Field
 from scipy.sparse.csgraph import minimum_spanning_tree
 
 from tron.captures.formats.colmap import INPUT, lens_of
@@ -39,7 +38,7 @@ from tron.captures.photos.photo_files import (
 from tron.captures.photos.photo_views import mask_of
 from tron.captures.photos.photographs import PosedPhoto, PosedPhotos
 from tron.captures.posing.wide_pictures import equirectangular, refuse_discs
-from tron.captures.settings import PhotoSettings
+from tron.captures.settings import PosingSettings
 from tron.errors import TronError
 from tron.io.colmap import points_of, posed_by, read_model
 from tron.lenses import impossible, load_pycolmap
@@ -64,37 +63,6 @@ _PANORAMA = "panorama_"
 """Prefix of the folders of equirectangular copies."""
 _PANORAMA_SIDE = 3
 """Times the pixels a side of other copies: all around is six usual views wide; features need half of that."""
-
-
-class MatchingSettings(BaseModel):
-    """Order of the photos, as the user knows it."""
-
-    matching: Literal["auto", "overlapping", "exhaustive", "sequential"] = Field(
-        default="auto",
-        description="how photos without poses are matched: overlapping compares each with the sixteen that "
-        "share most coarse features with it, exhaustive every pair, sequential each with the ten after it by "
-        "name; auto: sequential for videos, else overlapping",
-    )
-
-
-class PosingSettings(MatchingSettings, PhotoSettings):
-    """Structure from motion of photos without poses."""
-
-    workspace: Path | None = Field(
-        default=None, description="folder that keeps the poses; null: structure_from_motion beside the photos"
-    )
-    feature_side: int = Field(
-        default=1000, ge=64, description="features are sought in copies of at most so many pixels a side"
-    )
-    features: int = Field(
-        default=4096, ge=100, description="largest features that are kept of a photo, places in it"
-    )
-    threads: int = Field(
-        default=0,
-        ge=0,
-        description="threads; 0: all cores; 1 gives the same poses bit by bit, more nearly so",
-    )
-    seed: int = Field(default=0, description="root of the random samples that poses are estimated from")
 
 
 def has_photos(path: Path) -> bool:

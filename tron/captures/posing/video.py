@@ -10,17 +10,10 @@ from pathlib import Path
 import numpy as np
 
 from tron.captures.photos.photographs import PosedPhotos
-from tron.captures.photos.video_frames import (
-    FEWEST,
-    FRAMES,
-    WIDTH,
-    FrameSettings,
-    holds_frames,
-    keep_frames,
-    sharpest,
-)
-from tron.captures.posing.structure_from_motion import PosingSettings, pose_photos
+from tron.captures.photos.video_frames import FRAMES, WIDTH, holds_frames, keep_frames, sharpest
+from tron.captures.posing.structure_from_motion import pose_photos
 from tron.captures.posing.wide_pictures import refuse_video
+from tron.captures.settings import FEWEST, FrameSettings, PosingSettings
 from tron.errors import TronError
 from tron.io.recognised import VIDEOS
 from tron.io.video import duration_of, frames_of

@@ -12,9 +12,9 @@ import pytest
 import yaml
 
 from tron.apps.reconstruct import run as app
-from tron.apps.reconstruct.command import cli
+from tron.apps.reconstruct.cli import cli
 from tron.apps.reconstruct.pictures import sheet_estimation
-from tron.apps.relight.command import cli as relight_cli
+from tron.apps.relight.cli import cli as relight_cli
 from tron.cameras import Camera
 from tron.captures import Capture, View
 from tron.captures.folder import write_capture

@@ -9,14 +9,9 @@ import numpy as np
 import plyfile
 import pytest
 
-from tron.apps.reconstruct.command import cli
-from tron.apps.reconstruct.splat_capture import (
-    SplatSettings,
-    film_splats,
-    is_splats,
-    keeps_surfels,
-    virtual_cameras,
-)
+from tron.apps.reconstruct.cli import cli
+from tron.apps.reconstruct.settings import SplatSettings
+from tron.apps.reconstruct.splat_capture import film_splats, is_splats, keeps_surfels, virtual_cameras
 from tron.errors import TronError
 from tron.gaussians.fields import FIELDS
 from tron.gaussians.ply import MATERIAL_PROPERTIES

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from pydantic import Field
 
-from tron.apps.relight.command import main
+from tron.apps.relight.cli import main
 from tron.apps.relight.settings import DisplayOnly, Settings
 from tron.errors import TronError
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import yaml
 
-from tron.apps.relight.command import main
+from tron.apps.relight.cli import main
 from tron.apps.relight.settings import Settings
 from tron.gaussians.scene import GaussianScene
 from tron.io.images import read_image
