@@ -204,7 +204,7 @@ def test_help_lists_every_key_without_the_extra_and_names_it(smallest: Path, tmp
         "tron-export",
     )  # whose libraries this environment has
     extra = f"tron-relight[{'relight' if installed else command.removeprefix('tron-')}]"
-    first = f"of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
+    first = f"part of {extra}, which is installed" if installed else f"needs pip install '{extra}'"
     assert shown.stdout.startswith(first)
     assert "\n  output" in shown.stdout
 

@@ -156,7 +156,7 @@ class ConsoleScript:
                 absent = missing_libraries(extra)
                 known = f"{DISTRIBUTION}[{extra}]"
                 needs = f"needs pip install '{known}'; not installed here: {', '.join(absent)}"
-                print(f"{needs if absent else f'of {known}, which is installed'}\n", flush=True)
+                print(f"{needs if absent else f'part of {known}, which is installed'}\n", flush=True)
                 for each in self.named if absent else ():
                     import_without(each)
                 loaded = import_without(self.module).cli if absent else self.load()
