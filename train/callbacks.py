@@ -30,7 +30,7 @@ class TrainingLog(Callback):
     """Shows loss and validation PSNR on a bar (without a terminal: plain lines) and in metrics.csv.
 
     metrics.csv has one row every `every` steps and at every checkpoint: stage, step, seconds of this stage,
-    smoothed training loss (squared error of values in [-1, 1], plus LPIPS if on), learning rate, how many of
+    smoothed training loss (see `tron.neural.losses`), learning rate, how many of
     the stage's samples so far replaced damaged ones, and the latest validation's PSNR in dB. Loggers get the
     same numbers. A resumed run continues after the rows up to its checkpoint.
 

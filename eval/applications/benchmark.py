@@ -6,7 +6,7 @@ import logging
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from pydantic import Field, PositiveInt
+from pydantic import DirectoryPath, Field, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.report.outcome import Outcome
@@ -34,7 +34,9 @@ class Applications(Benchmark):
         description="arguments of tron-datagen: scenes with true object ids, for selecting and baking"
     )
     data: Path | None = Field(default=None, description="folder of these scenes if they exist already")
-    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no meshes")
+    real_data: DirectoryPath | None = Field(
+        default=None, description="folder with assets and hdri; null: no meshes"
+    )
 
     def check(self) -> None:
         """Check that the scenes exist, or the command that makes them."""

@@ -9,7 +9,7 @@ from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, ClassVar, Literal, NamedTuple
 
-from pydantic import BaseModel, ConfigDict, Field, PositiveFloat, PositiveInt
+from pydantic import BaseModel, ConfigDict, DirectoryPath, Field, PositiveFloat, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.reconstruction.fox import FoxRun, chosen_views, collect_fox, write_cameras
@@ -97,7 +97,9 @@ class Reconstruction(Benchmark):
     )
     relit: list[Name] = Field(description="ways to relight, besides all ways of the photographs")
     splats: SplatSettings = Field(description="settings of scans of plain splats, used as captures")
-    real_data: Path | None = Field(default=None, description="folder with captures/fox, hdri; null: no fox")
+    real_data: DirectoryPath | None = Field(
+        default=None, description="folder with captures/fox, hdri; null: no fox"
+    )
     fox_downscale: PositiveFloat = Field(default=4, description="downsampling factor of the photos")
     fox: list[str] = Field(description="further arguments of tron-reconstruct for the fox")
     hdris: list[str] = Field(description="files of real_data/hdri that relight the fox")

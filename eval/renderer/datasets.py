@@ -9,7 +9,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, ClassVar, Literal
 
-from pydantic import BaseModel, ConfigDict, Field, NonNegativeInt, PositiveInt
+from pydantic import BaseModel, ConfigDict, DirectoryPath, Field, NonNegativeInt, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.relighting.networks import find_weights
@@ -66,7 +66,9 @@ class RendererSettings(Benchmark):
         "synthetic_128, models_128_preview, models_512_few_final, captures, shadows",
     )
     synthetic: Sizes = Field(description="width of a frame -> recipe of held-out scenes and lights")
-    real_data: Path | None = Field(default=None, description="folder with assets and hdri; null: no models")
+    real_data: DirectoryPath | None = Field(
+        default=None, description="folder with assets and hdri; null: no models"
+    )
     models: Sizes = Field(description="width of a frame -> recipe of scenes of the models")
     qualities: dict[Quality, Recipe] = Field(
         description="quality of tron-relight -> further arguments for the recipes of models; path_spp "

@@ -6,7 +6,7 @@ import os
 from pathlib import Path
 from typing import ClassVar, Literal
 
-from pydantic import Field, PositiveInt
+from pydantic import DirectoryPath, Field, PositiveInt
 
 from eval.benchmark import Benchmark
 from eval.renderers.blender import INSTALL, blender_version
@@ -33,7 +33,9 @@ class Zoo(Benchmark):
     shapes: list[Kind] = Field(description="kinds of shapes", min_length=1)
     lights: list[str] | None = Field(default=None, description="names of lights; null: all")
     materials: PositiveInt | None = Field(default=None, description="most materials per shape; null: all")
-    real_data: Path | None = Field(default=None, description="folder with hdri; without it maps are drawn")
+    real_data: DirectoryPath | None = Field(
+        default=None, description="folder with hdri; without it maps are drawn"
+    )
     denoisers: bool = Field(default=True, description="measure denoisers and the shipped network too")
     blender_python: Path | None = Field(
         default=None, description="Python with bpy, in an environment of its own; null: no Cycles"

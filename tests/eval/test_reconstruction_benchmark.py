@@ -332,11 +332,17 @@ def test_a_way_is_of_scenes_or_of_photos(stand_ins: Path, tmp_path: Path, capfd:
     assert "way random is of photos and of scenes" in capfd.readouterr().err
 
 
-@pytest.mark.parametrize("real_data", ["null", "nowhere"])
-def test_without_real_data_the_fox_has_no_rows_and_no_section(
-    stand_ins: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture, real_data: str
+def test_real_data_that_is_nowhere_is_refused(
+    stand_ins: Path, tmp_path: Path, capfd: pytest.CaptureFixture[str]
 ):
-    assert run(tmp_path, "benchmark.parts=[fox]", f"benchmark.real_data={real_data}") == 0
+    assert run(tmp_path, "benchmark.parts=[fox]", "benchmark.real_data=nowhere") == 2
+    assert "benchmark.real_data" in capfd.readouterr().err
+
+
+def test_without_real_data_the_fox_has_no_rows_and_no_section(
+    stand_ins: Path, tmp_path: Path, caplog: pytest.LogCaptureFixture
+):
+    assert run(tmp_path, "benchmark.parts=[fox]", "benchmark.real_data=null") == 0
     assert "give benchmark.real_data=FOLDER" in caplog.text
     results = Results.load(tmp_path / "out" / "results.json")
     assert results.rows == []

@@ -9,10 +9,10 @@ from pathlib import Path
 ROOT = Path(__file__).resolve().parents[2]
 CODE = {
     "tron": (3_010, 19),
-    "tron/apps": (3_570, 24),
+    "tron/apps": (3_575, 24),
     "tron/brdf": (800, 7),
     "tron/captures": (5_175, 34),
-    "tron/cli": (1_580, 8),
+    "tron/cli": (1_585, 8),
     "tron/editing": (2_080, 13),
     "tron/gaussians": (3_745, 27),
     "tron/integrators": (1_000, 5),
@@ -40,7 +40,7 @@ TESTS = {
     "tests/eval": 7_400,
     "tests/examples": 450,
     "tests/field": 3_900,
-    "tests/house": 1_235,
+    "tests/house": 1_240,
     "tests/robustness": 2_500,
     "tests/slurm": 300,
     "tests/train": 3_250,

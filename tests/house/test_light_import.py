@@ -8,6 +8,7 @@ from importlib import import_module
 import pytest
 
 from tron.apps.splat_file import SPLATS
+from tron.captures.load import FORMATS
 from tron.cli import installation
 from tron.cli.recipes import field_keys
 from tron.gaussians.formats.registry import WRITTEN
@@ -80,6 +81,13 @@ def test_the_suffixes_that_help_names_are_those_that_are_written():
 def test_names_that_a_package_imports_later_are_there(package: str):
     module = import_module(f"tron.{package}")
     assert [name for name in module.__all__ if not hasattr(module, name)] == []
+
+
+def test_readers_that_the_capture_formats_import_later_are_there():
+    for each in FORMATS.values():
+        for reader in (each.detect, each.read):
+            module, name = getattr(reader, "args", (None, ""))[:2]
+            assert module is None or callable(getattr(import_module(module), name)), reader
 
 
 def test_a_scan_is_lit_and_its_materials_are_found_without_torch():

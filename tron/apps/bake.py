@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tron.apps.scene_file import SURROUNDINGS, FoundMaterials, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SPLATS, SceneFile
 from tron.cli.command_line import command
+from tron.cli.installation import loading
 from tron.cli.progress import track, working
 from tron.color import Look
 from tron.runtime import Threads, Variant, activate
@@ -65,13 +66,13 @@ def main(settings: Settings) -> None:
     values: viewers show them as they are. Reflections sharper than harmonics are blurred. The file has 3DGS'
     kernel and properties, in the scene's own frame; materials stay in the scene.
     """
-    # not for --help or a mistyped key
-    import numpy as np
+    with loading("tron-bake"):  # not for --help or a mistyped key
+        import numpy as np
 
-    from tron.gaussians.splat_files import check_count, check_suffix, write_splats
-    from tron.relighting.baking import baked
-    from tron.scans.scan import Scan
-    from tron.shading.environments.environment import EnvironmentMap
+        from tron.gaussians.splat_files import check_count, check_suffix, write_splats
+        from tron.relighting.baking import baked
+        from tron.scans.scan import Scan
+        from tron.shading.environments.environment import EnvironmentMap
 
     check_suffix(settings.output)
     check_scene_files(settings.scene, settings.output)

@@ -13,6 +13,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tron.apps.scene_file import FoundMaterials, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import ANEW, command
+from tron.cli.installation import loading
 from tron.cli.progress import track, working
 from tron.errors import TronError
 from tron.storage import write_atomic
@@ -75,8 +76,9 @@ def main(settings: Settings) -> None:
     materials, which are found first as by tron-relight, and in another folder its cameras.json and
     environment.exr. The same is in Python: tron.editing.
     """
-    from tron.editing import Insert, Material  # not for --help or a mistyped key
-    from tron.scans.scan import Scan
+    with loading("tron-edit"):  # not for --help or a mistyped key
+        from tron.editing import Insert, Material
+        from tron.scans.scan import Scan
 
     if settings.output.suffix.lower() != ".ply":
         mend = "give it a name that ends with .ply; tron-export makes other files of that"

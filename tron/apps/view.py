@@ -12,6 +12,7 @@ from pydantic import BaseModel, ConfigDict, Field
 from tron.apps.scene_file import GROUND, SeenAs, Up, check_scene_files
 from tron.apps.splat_file import SceneFile
 from tron.cli.command_line import command
+from tron.cli.installation import loading
 from tron.cli.progress import track, working
 from tron.errors import TronError
 from tron.runtime import Threads, Variant, activate
@@ -89,13 +90,13 @@ def opened(settings: Settings) -> Window:
     Raises:
         TronError: a file is missing or no scene, no map, no PLY; the port is taken.
     """
-    # viser and Mitsuba: not for --help
-    from tron.io.lights import LIGHT_SUFFIXES
-    from tron.scans.scan import Scan, is_of_capture
-    from tron.shading.environments.environment import EnvironmentMap
-    from tron.view.finding import MaterialSearch
-    from tron.view.opening import files_of, finish_of, first_light, home_of
-    from tron.view.window import Window, require_free_port
+    with loading("tron-view"):  # viser and Mitsuba: not for --help
+        from tron.io.lights import LIGHT_SUFFIXES
+        from tron.scans.scan import Scan, is_of_capture
+        from tron.shading.environments.environment import EnvironmentMap
+        from tron.view.finding import MaterialSearch
+        from tron.view.opening import files_of, finish_of, first_light, home_of
+        from tron.view.window import Window, require_free_port
 
     output = settings.output_dir
     if output.exists() and not output.is_dir():

@@ -85,7 +85,10 @@ def compose_recipe(
             if any(_in_target(values, key) for key in changed - _keys(recipe)):
                 recipe = complete(recipe)  # imports what it names
             for key in sorted(changed - _keys(recipe)):
-                raise unknown_key(key, [*_keys(recipe), *groups])
+                known = [*_keys(recipe), *groups]
+                if not did_you_mean(key, known):  # a key of what is imported, without its parents
+                    known += _keys(complete(recipe))
+                raise unknown_key(key, known)
             for each in keys:
                 _change(recipe, each)
             return recipe

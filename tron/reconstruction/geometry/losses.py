@@ -67,7 +67,7 @@ def loss_of(
 
     Args:
         rendered: images of :func:`tron.tracing.torch_bridge.render`.
-        target: the view's maps (see :func:`targets`), and ``fused_normal`` (see :mod:`.consistency`).
+        target: the view's maps (see :func:`targets`), and ``fused_normal`` (see :mod:`.fused_normals`).
         weights: of the maps.
         background: (3,) display colour behind the surfels.
     """

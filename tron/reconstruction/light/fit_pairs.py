@@ -197,7 +197,9 @@ class _Fit:
         finest = settings.resolution
         levels = [m for m in (1, 2, 4, 8, 16) if m < finest] + [finest]
         texels = 6 * finest * finest
-        self.levels = _single(np.concatenate([*(_spread(finest, m) for m in levels[:-1]), np.eye(texels)], 1))
+        self.spread = _single(
+            np.concatenate([np.zeros((texels, 0)), *(_spread(finest, m) for m in levels[:-1])], 1)
+        )
         sizes = [6 * m * m for m in levels]
         self.fine = _single(np.repeat([_SMOOTH * 2.0**k / n for k, n in enumerate(sizes, -1)], sizes))
         self.fine[: sizes[0]] = 0
@@ -228,7 +230,8 @@ class _Fit:
 
     def log_light(self) -> np.ndarray:
         """(D, 3) log radiance."""
-        return self.levels @ (self.values[:-1] @ _TO_LOG_RGB)
+        coarse, finest = np.split(self.values[:-1] @ _TO_LOG_RGB, [self.spread.shape[1]])
+        return self.spread @ coarse + finest
 
     def received(self) -> np.ndarray:
         """(P, 3) irradiance / pi under the current light."""
@@ -299,7 +302,7 @@ class _Fit:
             by_light += _SKY / light.size * trust * np.sign(light - shown) / far
 
         gradient, levels = np.zeros_like(self.values), self.values[:-1]
-        gradient[:-1] = (self.levels.T @ by_light) @ _TO_LOG_RGB.T
+        gradient[:-1] = np.concatenate([self.spread.T @ by_light, by_light]) @ _TO_LOG_RGB.T
         coloured = self.grey * (levels[:, 1:] @ _OFF_GREY)
         loss += float((self.fine * levels[:, 0] ** 2).sum() + (coloured * levels[:, 1:]).sum())
         gradient[:-1, 0] += 2 * self.fine * levels[:, 0]
