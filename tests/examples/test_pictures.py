@@ -105,7 +105,7 @@ def test_demo(tmp_path: Path):
 
 @pytest.mark.long
 def test_renderer(tmp_path: Path):
-    drawn_split(tmp_path, "test", {"test-000001-l1": 1, "test-000002-l0": 1}, 512)
+    drawn_split(tmp_path, "test", {"test-000001-l1": 1, "test-000001-l0": 1}, 512)
     run("renderer.py", tmp_path, tmp_path / "a.jpg")
     pictures(tmp_path / "a.jpg")
 
