@@ -105,9 +105,9 @@ class HelpPage:
         """
         page, known = [], list(self.groups)
         for key, field, default in _fields(self.settings, self.defaults):
-            inside = leaves(default) if isinstance(default, Mapping) else {}
-            known += [key, *(f"{key}.{each}" for each in inside)]
-            if f"{key}.".startswith(f"{name}.") or name in known[-len(inside) :][: len(inside)]:
+            inside = [f"{key}.{each}" for each in leaves(default)] if isinstance(default, Mapping) else []
+            known += [key, *inside]
+            if f"{key}.".startswith(f"{name}.") or name in inside:
                 page += _entry(key, field, default, self.width)
         if name in self.groups:
             page += [f"{name}=NAME", *_table(self.groups[name], self.width)]
