@@ -337,8 +337,6 @@ def test_real_data_that_is_nowhere_is_refused(
 ):
     assert run(tmp_path, "benchmark.parts=[fox]", "benchmark.real_data=nowhere") == 2
     assert "benchmark.real_data" in capfd.readouterr().err
-    assert run(tmp_path, "real_data=nowhere") == 2
-    assert "did you mean 'benchmark.real_data'" in capfd.readouterr().err, "of a class that a recipe names"
 
 
 def test_without_real_data_the_fox_has_no_rows_and_no_section(

@@ -143,3 +143,10 @@ def test_settings_out_of_range_are_refused(make_settings):
     for key, value in wrong.items():
         with pytest.raises(ValidationError, match=key):
             Settings.model_validate(plain | {key: value})
+
+
+def test_a_key_of_the_renderer_without_its_parents_is_suggested(capsys):
+    with pytest.raises(SystemExit) as end:
+        cli(["guidance=[pbr]", "dataset=data", "output_dir=out"])
+    assert end.value.code == 2
+    assert "did you mean 'renderer.config.guidance'" in capsys.readouterr().err
